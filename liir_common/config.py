@@ -1,0 +1,312 @@
+"""The configuration of a run: pydantic models; YAML file < environment < command line.
+
+Unknown keys are errors. A preset fills every value that was not written; `resolve` gives the complete
+tree, which the run directory keeps and a resumed run reads back.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic_settings import (
+    BaseSettings,
+    InitSettingsSource,
+    PydanticBaseSettingsSource,
+    SettingsConfigDict,
+)
+
+
+class ConfigError(ValueError):
+    """The configuration cannot be used; the message says which key, what was wanted and what came."""
+
+
+class Section(BaseModel):
+    """Base of all sections: frozen, unknown keys refused."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True)
+
+
+class EnvConfig(Section):
+    """What is played."""
+
+    kind: Literal["battle", "pettingzoo"] = "battle"
+    map: str = "3m"
+    """Battle map (`liir maps`)."""
+    factory: str = ""
+    """With kind pettingzoo: `module:function` that returns a ParallelEnv with one team reward."""
+    options: dict[str, bool | int | float | str] = {}
+    """Keyword arguments of the environment, for example reward_only_positive."""
+
+
+class ExplorationConfig(Section):
+    """Floor of the behaviour policy, lowered linearly over environment steps."""
+
+    start: float = Field(0.5, ge=0, le=1)
+    end: float = Field(0.01, ge=0, le=1)
+    steps: int = Field(50_000, ge=0)
+
+    def epsilon(self, env_steps: int) -> float:
+        """The floor after `env_steps` steps of the run."""
+        done = min(1.0, env_steps / self.steps) if self.steps else 1.0
+        return self.start + (self.end - self.start) * done
+
+
+class OptimizerConfig(Section):
+    """One optimiser."""
+
+    name: Literal["adam", "rmsprop"] = "adam"
+    lr: float = Field(5e-4, gt=0)
+    eps: float = Field(1e-5, gt=0)
+    alpha: float = Field(0.99, ge=0, lt=1)
+    """Smoothing of RMSprop's mean square."""
+    clip: float = Field(10.0, gt=0)
+    """Largest norm of the gradient."""
+
+
+class AlgorithmConfig(Section):
+    """The learning rule; one model for the whole LIIR family, so that comparisons share settings."""
+
+    name: Literal["liir", "central_v"] = "liir"
+    lambda_: float = Field(0.01, ge=0, alias="lambda")
+    """λ of Eq. (2): weight of the intrinsic reward; 0 is the control without it."""
+    freeze_eta: bool = False
+    """Control: η stays as initialised."""
+    outer_samples: Literal["reuse", "fresh"] = "reuse"
+    """Step 5 of Algorithm 1: reuse D with importance weights, or judge θ' on the next batch."""
+    r_in_bound: float = Field(10.0, gt=0)
+    """r_in is squashed to ± this value."""
+    gamma: float = Field(0.99, ge=0, le=1)
+    gae_lambda: float = Field(0.95, ge=0, le=1)
+    """λ_g of the advantages; 0 is TD(0) as the paper prints it."""
+    limit_is_terminal: bool = True
+    """Treat the step limit as an end; otherwise bootstrap there."""
+    normalize_advantages: bool = True
+    normalize_values: bool = True
+    target_interval: int = Field(0, ge=0)
+    """Learner steps between copies to the target critics; 0 means no target networks."""
+    policy_epochs: int = Field(4, ge=1)
+    """K policy steps per batch; the meta-gradient goes through the last."""
+    critic_epochs: int = Field(4, ge=1)
+    ratio_clip: float = Field(0.2, gt=0)
+    """Clip of the importance ratio in policy steps after the first."""
+    entropy: float = Field(0.03, ge=0)
+    orthogonal_init: bool = True
+    policy_gain: float = Field(0.01, gt=0)
+    """Gain of the policy head under orthogonal init."""
+    r_in_gain: float = Field(0.1, gt=0)
+    """Scale of the r_in head at the start."""
+    policy_hidden: int = Field(64, ge=1)
+    policy_optimizer: OptimizerConfig = OptimizerConfig()
+    eta_optimizer: OptimizerConfig = OptimizerConfig(eps=1e-10)
+    critic_optimizer: OptimizerConfig = OptimizerConfig()
+    exploration: ExplorationConfig = ExplorationConfig()
+    meta_gradient: Literal["jvp", "difference"] = "jvp"
+    """How c = <ũ, ∇log π> is computed: exact forward mode, or central difference (faster, 1e-5)."""
+
+
+class TrainingConfig(Section):
+    """How long and in what portions."""
+
+    total_env_steps: int = Field(3_000_000, gt=0)
+    batch_episodes: int = Field(32, ge=1)
+    lag: int = Field(0, ge=0, le=1)
+    """Learner steps that the actors' policy may be behind: 0 on-policy, 1 overlaps play and update."""
+    checkpoint_interval: int = Field(100, ge=1)
+    """Episodes between frozen checkpoints."""
+    save_interval: int = Field(50, ge=1)
+    """Learner steps between saves of the learner's own state."""
+
+
+class ActorsConfig(Section):
+    """The fleet."""
+
+    count: int = Field(32, ge=1)
+    ray_address: str = ""
+    """Ray cluster to join; empty starts one on this machine."""
+    ticket_timeout_s: float = Field(120.0, gt=0)
+    """A ticket that has not come back by then is given to another actor as well."""
+    metrics_port: int = Field(9102, ge=0, le=65535)
+
+
+class LearnerConfig(Section):
+    """The learner process."""
+
+    host: str = "127.0.0.1"
+    port: int = Field(50051, ge=0, le=65535)
+    """0 takes a free one; the run directory's endpoints.json says which."""
+    metrics_port: int = Field(9101, ge=0, le=65535)
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    threads: int = Field(2, ge=1)
+    """Threads of one matrix product."""
+    insecure: bool = False
+    """Serve plaintext on an address that is not loopback."""
+
+
+class EvaluationConfig(Section):
+    """Tests of the frozen checkpoints."""
+
+    enabled: bool = True
+    episodes: int = Field(20, ge=1)
+    """Greedy episodes per checkpoint; as many sampled ones are played beside them."""
+    metrics_port: int = Field(9103, ge=0, le=65535)
+
+
+class Config(BaseSettings):
+    """A whole run. Sources, strongest first: keyword arguments, LIIR_* environment, the file."""
+
+    model_config = SettingsConfigDict(
+        extra="forbid", frozen=True, env_prefix="LIIR_", env_nested_delimiter="__"
+    )
+
+    seed: int = Field(1, ge=0, lt=2**63)
+    preset: Literal["strong", "paper", "none"] = "strong"
+    """Fills whatever is not written: the learning rule and the reward that it was tuned with."""
+    env: EnvConfig = EnvConfig()
+    algorithm: AlgorithmConfig = AlgorithmConfig()
+    training: TrainingConfig = TrainingConfig()
+    actors: ActorsConfig = ActorsConfig()
+    learner: LearnerConfig = LearnerConfig()
+    evaluation: EvaluationConfig = EvaluationConfig()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _fill_preset(cls, data: dict[str, Any]) -> dict[str, Any]:
+        if isinstance(data.get("algorithm"), str):
+            data = data | {"algorithm": {"name": data["algorithm"]}}
+        return merge(PRESETS.get(data.get("preset", "strong"), {}), data)
+
+    @classmethod
+    def settings_customise_sources(
+        cls,
+        settings_cls: type[BaseSettings],
+        init_settings: PydanticBaseSettingsSource,
+        env_settings: PydanticBaseSettingsSource,
+        dotenv_settings: PydanticBaseSettingsSource,
+        file_secret_settings: PydanticBaseSettingsSource,
+    ) -> tuple[PydanticBaseSettingsSource, ...]:
+        """Order of the sources; the file comes last, through `load`."""
+        assert isinstance(init_settings, InitSettingsSource)
+        from_file = init_settings.init_kwargs.pop("_file", {})
+        return init_settings, env_settings, InitSettingsSource(settings_cls, from_file)
+
+    def tree(self) -> dict[str, Any]:
+        """The complete configuration as plain values, under the names a YAML file uses."""
+        return self.model_dump(mode="json", by_alias=True)
+
+
+_RMSPROP = {"name": "rmsprop", "lr": 5e-4, "alpha": 0.99, "eps": 1e-5, "clip": 10.0}
+PRESETS: Mapping[str, dict[str, Any]] = {
+    # What makes the method learn fast; the defaults of the models above are this preset.
+    "strong": {"env": {"options": {"reward_only_positive": True, "state_last_action": False}}},
+    # The released configuration: one plain step a batch, no normalisation, negative rewards.
+    "paper": {
+        "env": {"options": {"reward_only_positive": False, "state_last_action": False}},
+        "algorithm": {
+            "gae_lambda": 0.8,
+            "normalize_advantages": False,
+            "normalize_values": False,
+            "target_interval": 200,
+            "policy_epochs": 1,
+            "critic_epochs": 1,
+            "entropy": 0.0,
+            "orthogonal_init": False,
+            "policy_optimizer": _RMSPROP,
+            "eta_optimizer": _RMSPROP,
+            "critic_optimizer": _RMSPROP,
+        },
+    },
+}
+
+
+def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """`base` with the values of `over` laid on top, section by section."""
+    out = dict(base)
+    for key, value in over.items():
+        below = out.get(key)
+        both = isinstance(value, Mapping) and isinstance(below, Mapping)
+        out[key] = merge(below, value) if both else value
+    return out
+
+
+def load(path: Path | None = None, settings: Sequence[str] = ()) -> Config:
+    """Read a YAML file and lay `key.sub=value` settings over it.
+
+    Raises:
+        ConfigError: the file is missing or not YAML, a key is unknown, a value has the wrong type.
+    """
+    try:
+        return Config(_file=_read(path) if path else {}, **_parse_settings(settings))  # type: ignore[arg-type]
+    except ValidationError as error:
+        raise ConfigError(_explain(error)) from None
+
+
+def from_tree(tree: Mapping[str, Any]) -> Config:
+    """The configuration that `Config.tree` described; nothing else has a say.
+
+    Raises:
+        ConfigError: a key is unknown or missing, or a value has the wrong type.
+    """
+    try:
+        return Config.model_validate(dict(tree))
+    except ValidationError as error:
+        raise ConfigError(_explain(error)) from None
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        tree = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"cannot read the configuration {path}: {error.strerror}") from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path} is not YAML: {error}") from None
+    if tree is None:
+        return {}
+    if not isinstance(tree, dict):
+        raise ConfigError(f"{path}: wanted a mapping of settings, got {type(tree).__name__}")
+    return tree
+
+
+def _parse_settings(settings: Sequence[str]) -> dict[str, Any]:
+    tree: dict[str, Any] = {}
+    for setting in settings:
+        key, equals, text = setting.partition("=")
+        if not equals or not key:
+            raise ConfigError(f"--set wants key.sub=value, got {setting!r}")
+        try:
+            value = yaml.safe_load(text)
+        except yaml.YAMLError as error:
+            raise ConfigError(f"--set {key}: the value {text!r} is not YAML: {error}") from None
+        for part in reversed(key.split(".")):
+            value = {part: value}
+        tree = merge(tree, value)
+    return tree
+
+
+def _explain(error: ValidationError) -> str:
+    return "the configuration has errors:\n" + "\n".join(
+        f"  {_explain_one(item)}" for item in error.errors(include_url=False)
+    )
+
+
+def _explain_one(item: Any) -> str:
+    path = ".".join(str(part) for part in item["loc"])
+    if item["type"] != "extra_forbidden":
+        return f"{path}: {item['msg']}; got {item['input']!r}"
+    known = _known_keys(item["loc"][:-1])
+    close = difflib.get_close_matches(str(item["loc"][-1]), known, n=1)
+    hint = f"did you mean {close[0]!r}?" if close else f"known here: {', '.join(sorted(known))}"
+    return f"{path}: unknown key; {hint}"
+
+
+def _known_keys(section: Sequence[str | int]) -> list[str]:
+    model: type[BaseModel] = Config
+    for part in section:
+        field = next(f for name, f in model.model_fields.items() if part in (name, f.alias))
+        assert isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel)
+        model = field.annotation
+    return [field.alias or name for name, field in model.model_fields.items()]

@@ -20,9 +20,7 @@ from pydantic_settings import (
     SettingsConfigDict,
 )
 
-
-class ConfigError(ValueError):
-    """The configuration cannot be used; the message says which key, what was wanted and what came."""
+from liir_common.errors import ConfigError
 
 
 class Section(BaseModel):
@@ -128,6 +126,8 @@ class ActorsConfig(Section):
     count: int = Field(32, ge=1)
     ray_address: str = ""
     """Ray cluster to join; empty starts one on this machine."""
+    compress: bool = False
+    """Pack trajectories with zstd: a gain on slow links only."""
     ticket_timeout_s: float = Field(120.0, gt=0)
     """A ticket that has not come back by then is given to another actor as well."""
     metrics_port: int = Field(9102, ge=0, le=65535)
@@ -178,7 +178,9 @@ class Config(BaseSettings):
     def _fill_preset(cls, data: dict[str, Any]) -> dict[str, Any]:
         if isinstance(data.get("algorithm"), str):
             data = data | {"algorithm": {"name": data["algorithm"]}}
-        return merge(PRESETS.get(data.get("preset", "strong"), {}), data)
+        preset = str(data.get("preset", "strong"))
+        base: dict[str, Any] = PRESETS.get(preset, {})
+        return merge(base, data)
 
     @classmethod
     def settings_customise_sources(
@@ -240,7 +242,8 @@ def load(path: Path | None = None, settings: Sequence[str] = ()) -> Config:
         ConfigError: the file is missing or not YAML, a key is unknown, a value has the wrong type.
     """
     try:
-        return Config(_file=_read(path) if path else {}, **_parse_settings(settings))  # type: ignore[arg-type]
+        sources: dict[str, Any] = parse_settings(settings) | {"_file": _read(path) if path else {}}
+        return Config(**sources)
     except ValidationError as error:
         raise ConfigError(_explain(error)) from None
 
@@ -271,7 +274,12 @@ def _read(path: Path) -> dict[str, Any]:
     return tree
 
 
-def _parse_settings(settings: Sequence[str]) -> dict[str, Any]:
+def parse_settings(settings: Sequence[str]) -> dict[str, Any]:
+    """Tree of `key.sub=value` settings; values are YAML.
+
+    Raises:
+        ConfigError: a setting has another form.
+    """
     tree: dict[str, Any] = {}
     for setting in settings:
         key, equals, text = setting.partition("=")
@@ -307,6 +315,7 @@ def _known_keys(section: Sequence[str | int]) -> list[str]:
     model: type[BaseModel] = Config
     for part in section:
         field = next(f for name, f in model.model_fields.items() if part in (name, f.alias))
-        assert isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel)
+        assert isinstance(field.annotation, type)
+        assert issubclass(field.annotation, BaseModel)
         model = field.annotation
     return [field.alias or name for name, field in model.model_fields.items()]

@@ -11,6 +11,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from enum import StrEnum
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -207,7 +208,7 @@ class Batch:
             raise ValueError(f"a batch wants one policy version, got {sorted(versions)}")
         lengths = np.array([t.length for t in trajectories])
         steps = int(lengths.max())
-        padded = {name: _pad(trajectories, name, steps) for name in TRAJECTORY_ARRAYS}
+        padded: dict[str, Any] = {name: _pad(trajectories, name, steps) for name in TRAJECTORY_ARRAYS}
         played = np.arange(steps) < lengths[:, None]
         padded["mask"][np.arange(steps + 1) > lengths[:, None], :, 0] = True
         padded["actions"] = padded["actions"].astype(np.int64)

@@ -1,0 +1,47 @@
+# One command each: set up what is missing, then do the job.
+PYTHON ?= python3.11
+VENV := .venv
+BIN := $(VENV)/bin
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+
+.DEFAULT_GOAL := help
+
+help: ## Show this list
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
+
+# Stamped, so that set-up costs nothing once the pinned requirements are in.
+$(VENV)/.installed: requirements.txt requirements-dev.txt pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet -r requirements.txt -r requirements-dev.txt
+	$(BIN)/pip install --quiet --no-deps --no-build-isolation -e .
+	touch $@
+
+setup: $(VENV)/.installed ## Create .venv with the pinned requirements
+
+train: setup ## Train LIIR on 3m (ARGS="--set seed=7" adds settings)
+	$(BIN)/liir train --config configs/3m.yaml $(ARGS)
+
+test: setup ## Run every test
+	$(BIN)/pytest $(ARGS)
+
+lint: setup ## Check style, types, import rules and generated code
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+	$(MAKE) proto-check
+
+GEN := liir_common/rpc/gen
+
+proto: setup ## Generate the gRPC code from proto/
+	rm -rf $(GEN)
+	mkdir -p $(GEN)
+	$(BIN)/python -m grpc_tools.protoc -I proto --python_out=$(GEN) --pyi_out=$(GEN) --grpc_python_out=$(GEN) proto/liir/v1/*.proto
+	# protoc knows only top-level packages; ours live inside liir_common.
+	sed -i -E 's/^from liir\.v1 import/from liir_common.rpc.gen.liir.v1 import/' $$(find $(GEN) -name '*.py' -o -name '*.pyi')
+	touch $(GEN)/__init__.py $(GEN)/liir/__init__.py $(GEN)/liir/v1/__init__.py
+
+proto-check: proto
+	git diff --exit-code -- $(GEN)
+
+.PHONY: help setup train test lint proto proto-check

@@ -1,0 +1,174 @@
+"""Frozen checkpoints: a weights file in safetensors and a manifest that names its SHA-256.
+
+The manifest is written last, so a checkpoint exists exactly when its manifest does. A store may be a
+folder or any URL that fsspec knows.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import fsspec
+import numpy as np
+from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.numpy import load, save
+
+from liir_common.errors import CorruptError
+from liir_common.files import write_atomic
+
+Tensors = Mapping[str, NDArray[np.float32]]
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """What a checkpoint is and where it came from."""
+
+    episode: int
+    """Number of training episodes after which it was frozen; its name within the run."""
+    policy_version: int
+    env_steps: int
+    run_id: str
+    git_commit: str
+    env_spec: Mapping[str, Any]
+    """Fields of the `EnvSpec` it was trained on, simulator version included."""
+    config: Mapping[str, Any]
+    """The resolved configuration."""
+    created: float
+    """Unix time; not part of the weights file, so equal runs have equal digests."""
+    sha256: str
+    """Of the weights file, as hex."""
+    size_bytes: int
+
+    def to_json(self) -> str:
+        """The manifest file's text."""
+        return json.dumps(asdict(self), indent=1, sort_keys=True)
+
+    @classmethod
+    def from_json(cls, text: str) -> Manifest:
+        """Read a manifest.
+
+        Raises:
+            CorruptError: the text is not a manifest.
+        """
+        try:
+            return cls(**json.loads(text))
+        except (ValueError, TypeError) as error:
+            raise CorruptError(f"not a checkpoint manifest: {error}") from None
+
+
+def pack(tensors: Tensors) -> bytes:
+    """The weights file: equal tensors give equal bytes."""
+    return save({name: np.ascontiguousarray(tensors[name]) for name in sorted(tensors)})
+
+
+def unpack(data: bytes, sha256: str) -> dict[str, NDArray[np.float32]]:
+    """Tensors of a weights file.
+
+    Raises:
+        CorruptError: the bytes do not have that digest, or are not a weights file.
+    """
+    got = hashlib.sha256(data).hexdigest()
+    if got != sha256:
+        raise CorruptError(f"the weights file is corrupt: wanted SHA-256 {sha256}, got {got}; fetch it again")
+    try:
+        return load(data)
+    except (SafetensorError, KeyError) as error:
+        raise CorruptError(f"not a safetensors weights file: {error}") from None
+
+
+def section(tensors: Tensors, prefix: str) -> dict[str, NDArray[np.float32]]:
+    """The tensors named `prefix`.*, without the prefix: "policy" or "intrinsic"."""
+    start = f"{prefix}."
+    return {name.removeprefix(start): array for name, array in tensors.items() if name.startswith(start)}
+
+
+class CheckpointStore:
+    """The checkpoints of one run. Published ones never change."""
+
+    def __init__(self, url: str) -> None:
+        """Use the folder or fsspec URL, made if missing."""
+        self._fs, self._root = fsspec.core.url_to_fs(url)
+        self._fs.makedirs(self._root, exist_ok=True)
+        found = (path.rpartition("/")[2] for path in self._fs.ls(self._root, detail=False))
+        names = sorted(name for name in found if name.startswith("checkpoint-") and name.endswith(".json"))
+        self._manifests = [
+            self.read_manifest(int(name[len("checkpoint-") : -len(".json")])) for name in names
+        ]
+
+    @property
+    def manifests(self) -> list[Manifest]:
+        """All checkpoints, oldest first."""
+        return self._manifests
+
+    def publish(self, manifest: Manifest, data: bytes) -> bool:
+        """Write a checkpoint; false if a resumed run came to the same one again.
+
+        Raises:
+            CorruptError: a checkpoint of that episode exists with other weights, so this run is not the
+                one that the store belongs to, or is not reproducible.
+        """
+        for old in reversed(self._manifests):
+            if old.episode == manifest.episode:
+                if old.sha256 == manifest.sha256:
+                    return False
+                raise CorruptError(
+                    f"checkpoint {old.episode} exists with SHA-256 {old.sha256}, and this run made "
+                    f"{manifest.sha256}; use a new run directory, or resume with the build and machine "
+                    "type that began this one"
+                )
+        self._write(self._weights_path(manifest.episode), data)
+        self._write(self._manifest_path(manifest.episode), manifest.to_json().encode())
+        self._manifests.append(manifest)
+        return True
+
+    def find(self, episode: int) -> Manifest:
+        """The manifest of the checkpoint frozen after `episode` episodes.
+
+        Raises:
+            KeyError: there is none.
+        """
+        for manifest in self._manifests:
+            if manifest.episode == episode:
+                return manifest
+        raise KeyError(f"no checkpoint of episode {episode}")
+
+    def read(self, manifest: Manifest) -> bytes:
+        """The weights file, checked.
+
+        Raises:
+            CorruptError: the stored bytes do not have the manifest's digest.
+        """
+        data: bytes = self._fs.cat_file(self._weights_path(manifest.episode))
+        unpack(data, manifest.sha256)
+        return data
+
+    def read_manifest(self, episode: int) -> Manifest:
+        """Read one manifest from the store.
+
+        Raises:
+            CorruptError: the file is not a manifest.
+        """
+        path = self._manifest_path(episode)
+        try:
+            return Manifest.from_json(self._fs.cat_file(path).decode())
+        except (CorruptError, UnicodeDecodeError) as error:
+            raise CorruptError(f"{path}: {error}; remove it to go on without that checkpoint") from None
+
+    def _weights_path(self, episode: int) -> str:
+        return f"{self._root}/checkpoint-{episode:09d}.safetensors"
+
+    def _manifest_path(self, episode: int) -> str:
+        return f"{self._root}/checkpoint-{episode:09d}.json"
+
+    def _write(self, path: str, data: bytes) -> None:
+        if "file" in self._fs.protocol:
+            write_atomic(Path(path), data)
+        else:
+            # Object stores show an object when it is complete.
+            self._fs.pipe_file(path, data)

@@ -1,0 +1,190 @@
+"""`liir …`: every command; what is heavy is imported inside the command that needs it."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from liir_common import options
+from liir_common.errors import ConfigError, exit_on_error
+
+app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, add_completion=False)
+checkpoints = typer.Typer(no_args_is_help=True, help="Frozen checkpoints of a running learner.")
+bench = typer.Typer(no_args_is_help=True, help="Measure speed; medians of CPU time on this machine.")
+app.add_typer(checkpoints, name="checkpoints")
+app.add_typer(bench, name="bench")
+
+Map = Annotated[str, typer.Option("--map", help="Battle map.")]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+_PASS_ON = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
+
+
+def main() -> None:
+    """Entry point of the `liir` command."""
+    with exit_on_error():
+        app()
+
+
+@app.command()
+def train(
+    config: options.ConfigFile = None,
+    settings: options.Settings = None,
+    run_dir: options.RunDir = None,
+    resume: options.Resume = False,
+) -> None:
+    """Train on this machine: a learner, Ray actors and an evaluator, until the run is complete."""
+    from liir_common import logs
+    from liir_common.launch import Launcher
+
+    logs.configure("train")
+    path = run_dir or (_newest_run() if resume else None)
+    resolved = options.load_run_config(config, settings, path, resume)
+    path = path or Path("runs") / _run_name(resolved.env.map, resolved.algorithm.name, resolved.seed)
+    arguments = [] if config is None or resume else ["--config", str(config)]
+    arguments += [part for setting in settings or () for part in ("--set", setting)]
+    launcher = Launcher(path, arguments, resume)
+    summary = launcher.run(resolved.evaluation.enabled)
+    _print_summary(path, summary)
+    if launcher.stop_signal:
+        print(f"stopped early; go on with: liir train --resume --run-dir {path}", file=sys.stderr)
+        raise SystemExit(128 + launcher.stop_signal)
+
+
+def _run_name(map_name: str, algorithm: str, seed: int) -> str:
+    return f"{map_name}-{algorithm}-seed{seed}-{time.strftime('%Y%m%d-%H%M%S')}"
+
+
+def _newest_run() -> Path:
+    runs = sorted(Path("runs").glob("*/run.json"), key=lambda path: path.stat().st_mtime)
+    if not runs:
+        raise ConfigError("there is no run under runs/ to resume; name one with --run-dir")
+    return runs[-1].parent
+
+
+def _print_summary(run_dir: Path, summary: Any) -> None:
+    from dataclasses import asdict
+
+    print(f"\n{run_dir}")
+    for name, value in asdict(summary).items():
+        print(f"  {name.replace('_', ' '):30} {'–' if value is None else value}")
+    if summary.evaluations:
+        print(f"  curve: {run_dir / 'winrate.png'}")
+
+
+def _run_service(name: str, context: typer.Context) -> None:
+    import runpy
+
+    sys.argv = [f"liir {context.command.name}", *context.args]
+    # By name, not by import: the common package must not depend on the services.
+    runpy.run_module(f"services.{name}", run_name="__main__")
+
+
+@app.command(context_settings=_PASS_ON)
+def learner(context: typer.Context) -> None:
+    """Run the learner alone."""
+    _run_service("learner", context)
+
+
+@app.command(context_settings=_PASS_ON)
+def actors(context: typer.Context) -> None:
+    """Run the actor driver and its Ray actors alone."""
+    _run_service("actor", context)
+
+
+@app.command(context_settings=_PASS_ON)
+def evaluator(context: typer.Context) -> None:
+    """Run the evaluator alone."""
+    _run_service("evaluator", context)
+
+
+@app.command()
+def status(learner: options.Learner) -> None:
+    """Say how far a run is, as JSON."""
+    from google.protobuf.json_format import MessageToJson
+
+    from liir_common.client import TrainingClient
+
+    with TrainingClient(learner, timeout_s=10) as client:
+        print(MessageToJson(client.status()))
+
+
+@app.command()
+def stop(learner: options.Learner, reason: str = "asked on the command line") -> None:
+    """Ask a learner to finish its step, save and end."""
+    from liir_common.client import TrainingClient
+
+    with TrainingClient(learner, timeout_s=10) as client:
+        client.stop(reason)
+
+
+@checkpoints.command("list")
+def list_checkpoints(learner: options.Learner) -> None:
+    """One line per checkpoint: episode, environment steps, policy version, size, SHA-256."""
+    from liir_common.client import CheckpointClient
+
+    with CheckpointClient(learner, timeout_s=10) as client:
+        for frozen in client.list():
+            print(_line(frozen))
+
+
+@checkpoints.command("watch")
+def watch_checkpoints(learner: options.Learner, after: int = 0) -> None:
+    """The same lines as they come, until the run is complete."""
+    from liir_common.client import CheckpointClient
+
+    with CheckpointClient(learner, timeout_s=10) as client:
+        for frozen in client.watch(after):
+            print(_line(frozen), flush=True)
+
+
+@checkpoints.command("get")
+def get_checkpoint(
+    episode: int,
+    learner: options.Learner,
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write into.")] = Path(),
+) -> None:
+    """Download a checkpoint: its weights (safetensors) and its manifest (JSON), checked."""
+    from liir_common.client import CheckpointClient
+    from liir_common.files import write_atomic
+
+    with CheckpointClient(learner, timeout_s=10) as client:
+        manifest, data = client.download(episode)
+    output.mkdir(parents=True, exist_ok=True)
+    stem = output / f"checkpoint-{episode:09d}"
+    write_atomic(stem.with_suffix(".safetensors"), data)
+    write_atomic(stem.with_suffix(".json"), manifest.to_json().encode())
+    print(stem.with_suffix(".safetensors"))
+
+
+def _line(frozen: Any) -> str:
+    return (
+        f"{frozen.episode:>9} {frozen.env_steps:>10} {frozen.policy_version:>7} "
+        f"{frozen.size_bytes:>8} {frozen.sha256}"
+    )
+
+
+@app.command()
+def report(run_dir: Path) -> None:
+    """Write summary.json and winrate.png of a run again, and print the summary."""
+    from liir_common.report import write_report
+
+    if not (run_dir / "run.json").exists():
+        raise ConfigError(f"{run_dir} holds no run")
+    _print_summary(run_dir, write_report(run_dir))
+
+
+def _print_result(result: dict[str, Any], as_json: bool) -> None:
+    if as_json:
+        print(json.dumps(result))
+        return
+    for name, value in result.items():
+        print(f"{name:32} {value:,.4g}" if isinstance(value, float) else f"{name:32} {value}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,131 @@
+"""What a person sees while a run trains: a live panel on a terminal, a JSON line now and then elsewhere."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import Protocol
+
+import structlog
+from rich.console import Console
+from rich.live import Live
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+
+from liir_common.rpc.gen.liir.v1 import checkpoint_pb2, training_pb2
+
+log = structlog.get_logger()
+
+_LINE_EVERY_S = 10.0
+_PHASES = {
+    training_pb2.PHASE_COLLECTING: "actors play",
+    training_pb2.PHASE_UPDATING: "learner updates",
+    training_pb2.PHASE_EVALUATING: "last checkpoints are tested",
+    training_pb2.PHASE_STOPPING: "stopping",
+}
+
+
+class Display(Protocol):
+    """Shows how far a run is."""
+
+    def show(
+        self,
+        status: training_pb2.GetStatusResponse,
+        evaluations: Sequence[checkpoint_pb2.Evaluation],
+    ) -> None:
+        """Show this now; `evaluations` are all so far, oldest first."""
+
+    def close(self) -> None:
+        """Leave the terminal as it was."""
+
+
+def make_display(title: str, console: Console) -> Display:
+    """A live panel if the console is a terminal, log lines otherwise."""
+    return LivePanel(title, console) if console.is_terminal else LogLines()
+
+
+class LivePanel:
+    """Redraws one table in place."""
+
+    def __init__(self, title: str, console: Console) -> None:
+        """Begin drawing."""
+        self._title = title
+        self._live = Live(console=console, refresh_per_second=4, transient=False)
+        self._live.start()
+
+    def show(
+        self,
+        status: training_pb2.GetStatusResponse,
+        evaluations: Sequence[checkpoint_pb2.Evaluation],
+    ) -> None:
+        """Redraw."""
+        table = Table(title=self._title, show_header=False, title_justify="left", min_width=64)
+        table.add_column(style="dim")
+        table.add_column()
+        table.add_row(
+            "progress", ProgressBar(total=status.total_env_steps, completed=status.env_steps, width=44)
+        )
+        for name, value in rows(status, evaluations).items():
+            table.add_row(name, value)
+        self._live.update(table)
+
+    def close(self) -> None:
+        """Stop drawing; the last table stays."""
+        self._live.stop()
+
+
+class LogLines:
+    """Writes the same figures as a structured log line every ten seconds."""
+
+    def __init__(self) -> None:
+        """Begin; the first call of `show` writes a line."""
+        self._next = 0.0
+
+    def show(
+        self,
+        status: training_pb2.GetStatusResponse,
+        evaluations: Sequence[checkpoint_pb2.Evaluation],
+    ) -> None:
+        """Write a line if it is time for one."""
+        if time.monotonic() >= self._next:
+            self._next = time.monotonic() + _LINE_EVERY_S
+            log.info("training", **{k.replace(" ", "_"): v for k, v in rows(status, evaluations).items()})
+
+    def close(self) -> None:
+        """Nothing to undo."""
+
+
+def rows(
+    status: training_pb2.GetStatusResponse, evaluations: Sequence[checkpoint_pb2.Evaluation]
+) -> dict[str, str]:
+    """Names and values of what is shown."""
+    newest = status.metrics
+    rate, lag = status.env_steps_per_second, newest["policy_lag"]
+    return {
+        "phase": _PHASES.get(status.phase, "starting"),
+        "env steps": f"{status.env_steps:,} of {status.total_env_steps:,}, {rate:,.0f}/s",
+        "learner step": f"{status.learner_step:,} ({status.episodes:,} episodes, lag {lag:.0f})",
+        "return": f"{newest['return_mean']:.2f} over {newest['length_mean']:.0f} steps an episode",
+        "intrinsic / extrinsic": f"{newest['intrinsic_ratio']:.3f}" if "intrinsic_ratio" in newest else "–",
+        "win rate": _win_rates(evaluations),
+        "checkpoints": f"{status.evaluations:,} of {status.checkpoints:,} tested",
+        "actors": f"{status.actors} ({status.tickets_outstanding} tickets out)",
+        "time left": _time_left(status),
+    }
+
+
+def _win_rates(evaluations: Sequence[checkpoint_pb2.Evaluation]) -> str:
+    if not evaluations:
+        return "no checkpoint tested yet"
+    latest = " ".join(f"{e.greedy.wins / e.greedy.episodes:.0%}" for e in evaluations[-5:])
+    sampled = evaluations[-1].sampled
+    best = max(e.greedy.wins / e.greedy.episodes for e in evaluations)
+    return f"{latest} (best {best:.0%}; sampled {sampled.wins / sampled.episodes:.0%})"
+
+
+def _time_left(status: training_pb2.GetStatusResponse) -> str:
+    missing = max(0, status.total_env_steps - status.env_steps)
+    if not status.env_steps_per_second:
+        return "–" if missing else "0:00:00"
+    seconds = int(missing / status.env_steps_per_second)
+    return f"{seconds // 3600}:{seconds // 60 % 60:02d}:{seconds % 60:02d}"

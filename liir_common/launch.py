@@ -1,0 +1,208 @@
+"""`liir train`: learner, actors and evaluator as processes of this machine, started, watched, ended."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import signal
+import subprocess
+import sys
+import time
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import FrameType
+
+import grpc
+import structlog
+from rich.console import Console
+
+from liir_common.client import CheckpointClient, TrainingClient
+from liir_common.display import Display, make_display
+from liir_common.errors import ConfigError, LiirError
+from liir_common.report import Summary, write_report
+from liir_common.rpc.gen.liir.v1 import checkpoint_pb2
+
+log = structlog.get_logger()
+
+_POLL_S = 0.25
+_START_S = 120.0
+_STOP_S = 60.0
+_RESTARTS, _RESTARTS_WITHIN_S = 3, 60.0
+_PR_SET_PDEATHSIG = 1
+
+
+@dataclass
+class Service:
+    """One process of the run; its log is a file in the run directory."""
+
+    name: str
+    arguments: list[str]
+    log_path: Path
+    process: subprocess.Popen[bytes] | None = None
+    restarts: deque[float] = field(default_factory=lambda: deque(maxlen=_RESTARTS))
+
+    def start(self) -> None:
+        """Start it in a process group of its own, so that Ctrl-C reaches only the launcher."""
+        with self.log_path.open("ab") as file:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", f"services.{self.name}", *self.arguments],
+                stdout=file,
+                stderr=file,
+                stdin=subprocess.DEVNULL,
+                process_group=0,
+                preexec_fn=_die_with_parent,
+            )
+
+    @property
+    def exit_code(self) -> int | None:
+        """None while it runs."""
+        return self.process.poll() if self.process else None
+
+    def end(self, timeout_s: float = 10.0) -> None:
+        """Ask it to end, and insist after a while."""
+        if self.process is None or self.process.poll() is not None:
+            return
+        self.process.terminate()
+        try:
+            self.process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            log.warning("does not end when asked; killed", service=self.name)
+            self.process.kill()
+            self.process.wait()
+
+    def last_words(self, lines: int = 5) -> str:
+        """The end of its log."""
+        return "\n".join(self.log_path.read_text(errors="replace").splitlines()[-lines:])
+
+    def may_restart(self) -> bool:
+        """Whether another start makes sense: not after several deaths in a short time."""
+        now = time.monotonic()
+        if len(self.restarts) == _RESTARTS and now - self.restarts[0] < _RESTARTS_WITHIN_S:
+            return False
+        self.restarts.append(now)
+        return True
+
+
+def _die_with_parent() -> None:
+    """In a child on Linux: get SIGTERM when the launcher dies, however it dies."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+
+
+class Launcher:
+    """The whole service on one machine, from start to summary."""
+
+    def __init__(self, run_dir: Path, learner_arguments: Sequence[str], resume: bool) -> None:
+        """Prepare to run in `run_dir`; the arguments are those of `liir learner`."""
+        self._run_dir = run_dir
+        logs = run_dir / "logs"
+        logs.mkdir(parents=True, exist_ok=True)
+        arguments = ["--run-dir", str(run_dir), *learner_arguments]
+        self._learner = Service(
+            "learner", [*arguments, *(["--resume"] if resume else [])], logs / "learner.log"
+        )
+        self._actors = Service("actor", [], logs / "actors.log")
+        self._evaluator = Service("evaluator", [], logs / "evaluator.log")
+        self._stop_signal = 0
+
+    def run(self, evaluate: bool) -> Summary:
+        """Train until the run is complete or a signal asks to stop; the summary is of what there is then.
+
+        Raises:
+            LiirError: a process cannot be kept running; the message has its last words.
+        """
+        for signum in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(signum, self._on_signal)
+        try:
+            address = self._start(evaluate)
+            self._watch(address)
+        finally:
+            for service in (self._evaluator, self._actors, self._learner):
+                service.end()
+        return write_report(self._run_dir)
+
+    @property
+    def stop_signal(self) -> int:
+        """The signal that ended training early, or 0."""
+        return self._stop_signal
+
+    def _on_signal(self, signum: int, frame: FrameType | None) -> None:
+        self._stop_signal = signum
+
+    def _start(self, evaluate: bool) -> str:
+        (self._run_dir / "endpoints.json").unlink(missing_ok=True)
+        self._learner.start()
+        address = self._wait_for_endpoints()
+        # A learner that is started again must be found where it was.
+        self._learner.arguments += ["--set", f"learner.port={address.rpartition(':')[2]}"]
+        if "--resume" not in self._learner.arguments:
+            self._learner.arguments.append("--resume")
+        for service in (self._actors, self._evaluator) if evaluate else (self._actors,):
+            service.arguments += ["--learner", address]
+            service.start()
+        return address
+
+    def _wait_for_endpoints(self) -> str:
+        path = self._run_dir / "endpoints.json"
+        deadline = time.monotonic() + _START_S
+        while time.monotonic() < deadline:
+            if path.exists():
+                return str(json.loads(path.read_text())["address"])
+            if self._learner.exit_code is not None:
+                self._raise_death(self._learner)
+            time.sleep(_POLL_S / 5)
+        raise LiirError(f"the learner did not start within {_START_S:g} s:\n{self._learner.last_words()}")
+
+    def _watch(self, address: str) -> None:
+        console = Console(stderr=True)
+        display = make_display(f"LIIR · {self._run_dir}", console)
+        shown: list[checkpoint_pb2.Evaluation] = []
+        try:
+            with TrainingClient(address) as training, CheckpointClient(address) as checkpoints:
+                while not self._stop_signal and self._learner.exit_code != 0:
+                    self._revive()
+                    self._show(display, training, checkpoints, shown)
+                    time.sleep(_POLL_S)
+                if self._stop_signal:
+                    self._stop(training)
+        finally:
+            display.close()
+
+    def _show(
+        self,
+        display: Display,
+        training: TrainingClient,
+        checkpoints: CheckpointClient,
+        shown: list[checkpoint_pb2.Evaluation],
+    ) -> None:
+        try:
+            shown.extend(checkpoints.evaluations(shown[-1].episode if shown else 0))
+            display.show(training.status(), shown)
+        except grpc.RpcError as error:
+            log.info("the learner does not answer", reason=error.details())
+
+    def _revive(self) -> None:
+        """Start again what died; the run goes on as if nothing had happened."""
+        for service in (self._learner, self._actors, self._evaluator):
+            code = service.exit_code
+            if code in (None, 0):
+                continue
+            if code in (ConfigError.exit_code,) or not service.may_restart():
+                self._raise_death(service)
+            log.error("a process died; it is started again", service=service.name, exit_code=code)
+            service.start()
+
+    def _stop(self, training: TrainingClient) -> None:
+        training.stop(f"signal {signal.Signals(self._stop_signal).name}")
+        assert self._learner.process is not None
+        try:
+            self._learner.process.wait(_STOP_S)
+        except subprocess.TimeoutExpired:
+            log.warning("the learner did not end in time", timeout_s=_STOP_S)
+
+    def _raise_death(self, service: Service) -> None:
+        error = LiirError(f"the {service.name} ended with code {service.exit_code}:\n{service.last_words()}")
+        error.exit_code = service.exit_code or 1
+        raise error

@@ -1,0 +1,46 @@
+"""Command-line options that several commands share."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+import yaml
+
+from liir_common import config
+from liir_common.config import Config
+from liir_common.errors import ConfigError
+
+ConfigFile = Annotated[Path | None, typer.Option("--config", help="YAML file with the configuration.")]
+Settings = Annotated[
+    list[str] | None, typer.Option("--set", help="key.sub=value, stronger than file and environment.")
+]
+RunDir = Annotated[
+    Path | None, typer.Option("--run-dir", help="Run directory; a new one under runs/ if absent.")
+]
+Resume = Annotated[bool, typer.Option("--resume", help="Go on with the run in the run directory.")]
+Learner = Annotated[str, typer.Option("--learner", help="HOST:PORT of the learner.")]
+
+
+def load_run_config(
+    file: Path | None, settings: list[str] | None, run_dir: Path | None, resume: bool
+) -> Config:
+    """Configuration of a run: a resumed one keeps its own, with the settings laid over it.
+
+    Raises:
+        ConfigError: there is a run and `resume` is false, or the other way round, or the configuration
+            cannot be used.
+    """
+    if run_dir is not None:
+        _check_run_dir(run_dir, resume)
+    if not resume or run_dir is None:
+        return config.load(file, settings or ())
+    kept = yaml.safe_load((run_dir / "config.yaml").read_text(encoding="utf-8"))
+    return config.from_tree(config.merge(kept, config.parse_settings(settings or ())))
+
+
+def _check_run_dir(run_dir: Path, resume: bool) -> None:
+    exists = (run_dir / "run.json").exists()
+    if exists and not resume:
+        raise ConfigError(f"{run_dir} holds a run already; go on with --resume, or name another --run-dir")
+    if resume and not exists:
+        raise ConfigError(f"{run_dir} holds no run to resume; leave out --resume to begin one there")

@@ -1,0 +1,105 @@
+"""What a run came to: a summary and the win-rate curve, from the files in its run directory."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from liir_common.files import Table, write_atomic
+
+_LEVEL = 0.9
+_IN_A_ROW = 3
+_LAST = 10
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Figures of one run; win rates are wins / episodes of 20 test episodes unless configured otherwise."""
+
+    learner_steps: int
+    env_steps: int
+    episodes: int
+    evaluations: int
+    first_win_rate_90_env_steps: int | None
+    """Environment steps of the first greedy evaluation at 90 % or above."""
+    first_win_rate_90_seconds: float | None
+    """Seconds from the beginning of the run until that checkpoint was frozen."""
+    reached_90_env_steps: int | None
+    """The same for the first of three such evaluations in a row: one alone can be luck."""
+    last_ten_greedy: float | None
+    """Mean greedy win rate of the last ten evaluations."""
+    last_ten_sampled: float | None
+    best_greedy: float | None
+
+
+def summarise(run_dir: Path) -> Summary:
+    """Read the figures of the run in `run_dir`."""
+    steps = Table(run_dir / "metrics.csv").rows
+    tests = sorted(Table(run_dir / "evaluations.csv").rows, key=lambda row: int(row["episode"]))
+    greedy = [float(row["greedy_win_rate"]) for row in tests]
+    sampled = [float(row["sampled_win_rate"]) for row in tests]
+    first = _first(greedy, 1)
+    lasting = _first(greedy, _IN_A_ROW)
+    last = steps[-1] if steps else {"learner_step": "0", "env_steps": "0", "episodes": "0"}
+    return Summary(
+        learner_steps=int(last["learner_step"]),
+        env_steps=int(last["env_steps"]),
+        episodes=int(last["episodes"]),
+        evaluations=len(tests),
+        first_win_rate_90_env_steps=int(tests[first]["env_steps"]) if first is not None else None,
+        first_win_rate_90_seconds=float(tests[first]["seconds"]) if first is not None else None,
+        reached_90_env_steps=int(tests[lasting]["env_steps"]) if lasting is not None else None,
+        last_ten_greedy=_mean(greedy[-_LAST:]),
+        last_ten_sampled=_mean(sampled[-_LAST:]),
+        best_greedy=max(greedy, default=None),
+    )
+
+
+def write_report(run_dir: Path) -> Summary:
+    """Write summary.json and, once there are evaluations, winrate.png into `run_dir`."""
+    summary = summarise(run_dir)
+    write_atomic(run_dir / "summary.json", json.dumps(asdict(summary), indent=1).encode())
+    if summary.evaluations:
+        plot_win_rate({run_dir.name: [run_dir]}, run_dir / "winrate.png")
+    return summary
+
+
+def plot_win_rate(groups: dict[str, list[Path]], output: Path) -> None:
+    """Draw greedy (solid) and sampled (faint) win rate against environment steps, a colour per group."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7, 4), layout="constrained")
+    axes = figure.subplots()
+    for number, (label, run_dirs) in enumerate(groups.items()):
+        for run_dir in run_dirs:
+            tests = sorted(Table(run_dir / "evaluations.csv").rows, key=lambda row: int(row["episode"]))
+            steps = [int(row["env_steps"]) for row in tests]
+            for actions, alpha in (("greedy", 1.0), ("sampled", 0.35)):
+                rates = [float(row[f"{actions}_win_rate"]) for row in tests]
+                name = f"{label}, {actions}" if run_dir is run_dirs[0] else None
+                axes.plot(steps, _smooth(rates), color=f"C{number}", label=name, alpha=alpha)
+    axes.set(xlabel="environment steps", ylabel="win rate", ylim=(-0.02, 1.02))
+    axes.axhline(_LEVEL, color="grey", lw=0.8, ls=":")
+    axes.grid(alpha=0.25)
+    axes.legend(loc="lower right")
+    axes.set_title("Win rate of frozen checkpoints, mean of five evaluations", fontsize=10)
+    figure.savefig(output, dpi=120)
+
+
+def _smooth(values: list[float], window: int = 5) -> list[float]:
+    """Mean of each value and those before it in the window."""
+    return [
+        sum(part) / len(part) for i in range(len(values)) if (part := values[max(0, i + 1 - window) : i + 1])
+    ]
+
+
+def _first(rates: list[float], in_a_row: int) -> int | None:
+    for i in range(len(rates) - in_a_row + 1):
+        if all(rate >= _LEVEL for rate in rates[i : i + in_a_row]):
+            return i
+    return None
+
+
+def _mean(values: list[float]) -> float | None:
+    return sum(values) / len(values) if values else None

@@ -1,0 +1,184 @@
+"""Between our types and wire messages; whatever comes off a wire is checked here, before it is allocated.
+
+Every function that decodes raises `ValueError` with what was wanted and what came.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+import zstandard
+from numpy.typing import NDArray
+
+from liir_common import types
+from liir_common.rpc.gen.liir.v1 import rollout_pb2, tensor_pb2
+from liir_common.types import EnvSpec, Exploration, Ticket, Trajectory, Weights
+
+Array = NDArray[np.generic]
+
+_DTYPES = {
+    tensor_pb2.DTYPE_FLOAT32: np.dtype("<f4"),
+    tensor_pb2.DTYPE_BOOL: np.dtype("?"),
+    tensor_pb2.DTYPE_INT16: np.dtype("<i2"),
+}
+_DTYPE_CODES = {dtype: code for code, dtype in _DTYPES.items()}
+_EXPLORATIONS = {
+    Exploration.SOFTMAX_FLOOR: rollout_pb2.EXPLORATION_SOFTMAX_FLOOR,
+    Exploration.EPSILON_GREEDY: rollout_pb2.EXPLORATION_EPSILON_GREEDY,
+    Exploration.GREEDY: rollout_pb2.EXPLORATION_GREEDY,
+}
+_EXPLORATION_NAMES = {code: name for name, code in _EXPLORATIONS.items()}
+
+
+def encode_tensor(array: Array, compress: bool = False) -> tensor_pb2.Tensor:
+    """Message with the array's bytes, packed with zstd if asked."""
+    data = array.tobytes()
+    if compress:
+        data = zstandard.ZstdCompressor(level=1).compress(data)
+    code = _DTYPE_CODES[array.dtype]
+    return tensor_pb2.Tensor(dtype=code, shape=array.shape, data=data, zstd=compress)
+
+
+def decode_tensor(
+    message: tensor_pb2.Tensor, name: str, dtype: np.dtype[np.generic], shape: tuple[int, ...]
+) -> Array:
+    """Read-only array of exactly the wanted dtype and shape, sharing the message's bytes if it can."""
+    got = _DTYPES.get(message.dtype)
+    if got != dtype or tuple(message.shape) != shape:
+        raise ValueError(
+            f"{name}: wanted {dtype.name} {list(shape)}, "
+            f"got {got.name if got else 'an unknown dtype'} {list(message.shape)}"
+        )
+    size = dtype.itemsize * int(np.prod(shape, dtype=np.int64))
+    data = _unpack(message.data, name, size) if message.zstd else message.data
+    if len(data) != size:
+        raise ValueError(f"{name}: wanted {size} bytes for {dtype.name} {list(shape)}, got {len(data)}")
+    if dtype == np.bool_ and data.translate(None, b"\0\1"):
+        raise ValueError(f"{name}: wanted booleans as bytes 0 or 1, got other bytes")
+    return np.frombuffer(data, dtype).reshape(shape)
+
+
+def _unpack(data: bytes, name: str, size: int) -> bytes:
+    # The frame's own claim is checked first: it is what the library would allocate.
+    try:
+        claimed = zstandard.frame_content_size(data)
+        if claimed != size:
+            raise ValueError(f"{name}: wanted a zstd frame of {size} bytes, got one of {claimed}")
+        return zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
+    except zstandard.ZstdError as error:
+        raise ValueError(f"{name}: wanted a zstd frame of {size} bytes, got {error}") from None
+
+
+def encode_policy(version: int, weights: Weights) -> rollout_pb2.Policy:
+    """Message with all tensors of the policy."""
+    tensors = (
+        tensor_pb2.NamedTensor(name=name, tensor=encode_tensor(array)) for name, array in weights.items()
+    )
+    return rollout_pb2.Policy(version=version, tensors=tensors)
+
+
+def decode_policy(message: rollout_pb2.Policy, shapes: Mapping[str, tuple[int, ...]]) -> Weights:
+    """Weights with exactly the wanted names and shapes."""
+    names = [item.name for item in message.tensors]
+    if sorted(names) != sorted(shapes):
+        raise ValueError(f"policy: wanted tensors {sorted(shapes)}, got {sorted(names)}")
+    float32 = np.dtype(np.float32)
+    return {
+        item.name: decode_tensor(
+            item.tensor, f"policy tensor {item.name}", float32, shapes[item.name]
+        ).astype(np.float32, copy=False)
+        for item in message.tensors
+    }
+
+
+def encode_ticket(ticket: Ticket) -> rollout_pb2.Ticket:
+    """Message of a ticket."""
+    return rollout_pb2.Ticket(
+        episode_id=ticket.episode_id,
+        policy_version=ticket.policy_version,
+        seed=ticket.seed,
+        exploration=_EXPLORATIONS[ticket.exploration],
+        epsilon=ticket.epsilon,
+    )
+
+
+def decode_ticket(message: rollout_pb2.Ticket) -> Ticket:
+    """Ticket of a message."""
+    exploration = _EXPLORATION_NAMES.get(message.exploration)
+    if exploration is None:
+        raise ValueError(f"ticket: wanted an exploration this build knows, got {message.exploration}")
+    return Ticket(message.episode_id, message.policy_version, message.seed, exploration, message.epsilon)
+
+
+def encode_trajectory(
+    trajectory: Trajectory, stats: rollout_pb2.ActorStats, compress: bool = False
+) -> rollout_pb2.Trajectory:
+    """Message with everything the episode produced."""
+    return rollout_pb2.Trajectory(
+        episode_id=trajectory.episode_id,
+        policy_version=trajectory.policy_version,
+        terminated=trajectory.terminated,
+        truncated=trajectory.truncated,
+        info=list(trajectory.info.values()),
+        stats=stats,
+        **{name: encode_tensor(getattr(trajectory, name), compress) for name in types.TRAJECTORY_ARRAYS},
+    )
+
+
+def decode_trajectory(message: rollout_pb2.Trajectory, spec: EnvSpec) -> Trajectory:
+    """Trajectory whose sizes fit the environment and whose content could have been played."""
+    length = message.reward.shape[0] if len(message.reward.shape) == 1 else 0
+    if not 1 <= length <= spec.episode_limit:
+        raise ValueError(
+            f"reward: wanted shape [T] with T in 1..{spec.episode_limit}, got {list(message.reward.shape)}"
+        )
+    if len(message.info) != len(spec.info_keys):
+        raise ValueError(f"info: wanted {len(spec.info_keys)} figures, got {len(message.info)}")
+    arrays = {
+        name: decode_tensor(
+            getattr(message, name), name, np.dtype(dtype), types.expected_shape(name, spec, length)
+        )
+        for name, (dtype, _) in types.TRAJECTORY_ARRAYS.items()
+    }
+    trajectory = Trajectory(
+        episode_id=message.episode_id,
+        policy_version=message.policy_version,
+        terminated=message.terminated,
+        truncated=message.truncated,
+        info=dict(zip(spec.info_keys, message.info, strict=True)),
+        **arrays,  # type: ignore[arg-type]
+    )
+    check_playable(trajectory, spec)
+    return trajectory
+
+
+def check_playable(trajectory: Trajectory, spec: EnvSpec) -> None:
+    """Refuse what no episode can produce; it would poison the learner.
+
+    Raises:
+        ValueError: a figure is not finite, an agent has no available action, an action is out of range
+            or not available, or the episode has no end.
+    """
+    if not (trajectory.terminated or trajectory.truncated):
+        raise ValueError("trajectory: wanted terminated or truncated, got neither")
+    for name in ("obs", "state", "log_mu", "reward"):
+        if not np.isfinite(getattr(trajectory, name)).all():
+            raise ValueError(f"{name}: wanted finite numbers, got NaN or infinity")
+    if not np.isfinite(list(trajectory.info.values())).all():
+        raise ValueError("info: wanted finite numbers, got NaN or infinity")
+    if (trajectory.log_mu > 0).any():
+        raise ValueError("log_mu: wanted logarithms of probabilities, got a positive one")
+    stuck = ~np.logical_or.reduce(trajectory.mask, axis=-1)
+    if stuck.any():
+        raise ValueError(f"mask: {_first(stuck)} has no available action")
+    actions = trajectory.actions
+    bad = (actions < 0) | (actions >= spec.n_actions)
+    if bad.any():
+        raise ValueError(f"actions: wanted 0..{spec.n_actions - 1}, {_first(bad)} has another")
+    taken = np.take_along_axis(trajectory.mask[:-1], actions[..., None].astype(np.intp), axis=-1)[..., 0]
+    if not taken.all():
+        raise ValueError(f"actions: {_first(~taken)} took an action that its mask forbids")
+
+
+def _first(where: Array) -> str:
+    step, agent = np.argwhere(where)[0]
+    return f"agent {agent} at step {step}"

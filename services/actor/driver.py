@@ -1,0 +1,122 @@
+"""The fleet: N Ray actors kept alive until the run is complete."""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import ray
+import structlog
+
+from liir_common import metrics
+from liir_common.config import ActorsConfig, Config
+from liir_common.errors import LiirError
+from liir_common.rpc.channel import backoffs
+from services.actor.rollout_actor import RolloutActor
+
+log = structlog.get_logger()
+
+_POLL_S = 1.0
+_QUICK_DEATH_S = 10.0
+"""An actor that dies sooner is started again more and more slowly."""
+
+
+@dataclass
+class _Member:
+    """One place in the fleet, whoever fills it."""
+
+    name: str
+    incarnation: int = -1
+    started: float = 0.0
+    start_at: float = 0.0
+    run: ray.ObjectRef | None = None
+
+
+class Fleet:
+    """Starts the actors and replaces those that die."""
+
+    def __init__(self, address: str, config: Config) -> None:
+        """Play for the learner at `address`; Ray must be initialised."""
+        self._address = address
+        self._config = config
+        # An actor waits more than it computes and does not say how many cores it needs: no CPU is
+        # reserved, so that any number of actors fits, spread evenly over the nodes.
+        self._actor_class: Any = ray.remote(num_cpus=0, scheduling_strategy="SPREAD")(RolloutActor)
+        self._members = [_Member(f"actor-{i:03d}") for i in range(config.actors.count)]
+        self._waits = {member.name: backoffs() for member in self._members}
+
+    def run(self) -> None:
+        """Return when every actor was told that the run is complete.
+
+        Raises:
+            LiirError: the learner refused an actor.
+        """
+        for member in self._members:
+            self._start(member)
+        while self._members:
+            metrics.ACTORS_ALIVE.set(sum(member.run is not None for member in self._members))
+            self._restart_due()
+            self._collect_ended()
+
+    def _start(self, member: _Member) -> None:
+        member.incarnation += 1
+        member.started = time.monotonic()
+        actor = self._actor_class.remote(member.name, member.incarnation, self._address, self._config.tree())
+        member.run = actor.run.remote()
+
+    def _restart_due(self) -> None:
+        now = time.monotonic()
+        for member in self._members:
+            if member.run is None and member.start_at <= now:
+                self._start(member)
+
+    def _collect_ended(self) -> None:
+        running = {member.run: member for member in self._members if member.run is not None}
+        if not running:
+            time.sleep(_POLL_S / 10)
+            return
+        ended, _ = ray.wait(list(running), timeout=_POLL_S)
+        for reference in ended:
+            member = running[reference]
+            try:
+                ray.get(reference)
+            except ray.exceptions.RayTaskError as error:
+                raise LiirError(f"{member.name} cannot play: {error.cause}") from error
+            except ray.exceptions.RayActorError as error:
+                self._died(member, error)
+            else:
+                self._members.remove(member)
+
+    def _died(self, member: _Member, error: Exception) -> None:
+        now = time.monotonic()
+        if now - member.started > _QUICK_DEATH_S:
+            self._waits[member.name] = backoffs()
+        wait = next(self._waits[member.name])
+        log.error(
+            "an actor died; it is started again", actor=member.name, wait_s=round(wait, 2), error=str(error)
+        )
+        metrics.ACTOR_RESTARTS.inc()
+        member.run, member.start_at = None, now + wait
+
+
+def start_ray(config: ActorsConfig) -> None:
+    """Join the configured Ray cluster, or start one on this machine.
+
+    Raises:
+        LiirError: the cluster cannot be reached.
+    """
+    # Ray decides by itself when this is unset, and writes a token into the home folder.
+    os.environ.setdefault("RAY_AUTH_MODE", "disabled")
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    try:
+        if config.ray_address:
+            ray.init(address=config.ray_address, namespace="liir")
+        else:
+            # Trajectories go over gRPC, so the object store can be as small as Ray allows.
+            ray.init(address="local", include_dashboard=False, object_store_memory=80 * 2**20)
+    except (ConnectionError, RuntimeError, ValueError) as error:
+        raise LiirError(
+            f"cannot start or join Ray at {config.ray_address or 'this machine'}: {error}"
+        ) from None

@@ -1,0 +1,89 @@
+"""One actor: asks for tickets, plays them, hands in the trajectories."""
+
+from __future__ import annotations
+
+import queue
+import time
+
+import grpc
+import structlog
+
+from liir_common import logs, types
+from liir_common.build import build
+from liir_common.config import Config, from_tree
+from liir_common.rollout.play import make_player
+from liir_common.rollout.player import Player
+from liir_common.rpc import channel, codec
+from liir_common.rpc.gen.liir.v1 import rollout_pb2, rollout_pb2_grpc
+
+log = structlog.get_logger()
+
+_RETRIED = (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.CANCELLED)
+_NEXT_TICKET = rollout_pb2.PlayRequest(ready=rollout_pb2.Ready(tickets=1))
+
+
+class RolloutActor:
+    """Plays for a learner until the run is complete; made a Ray actor by the driver."""
+
+    def __init__(self, name: str, incarnation: int, address: str, config_tree: dict[str, object]) -> None:
+        """Get ready to play; nothing is asked for yet."""
+        logs.configure(name)
+        self._hello = (name, incarnation)
+        self._address = address
+        config: Config = from_tree(config_tree)
+        self._compress = config.actors.compress
+        self._player: Player = make_player(config.env, config.algorithm.policy_hidden)
+        self._shapes = types.policy_shapes(self._player.spec, config.algorithm.policy_hidden)
+
+    def run(self) -> None:
+        """Play until the learner says that the run is complete.
+
+        Raises:
+            grpc.RpcError: the learner refused this actor; to try again would not help.
+        """
+        waits = channel.backoffs()
+        while True:
+            try:
+                with grpc.insecure_channel(self._address, options=channel.CHANNEL_OPTIONS) as connection:
+                    if self._serve(rollout_pb2_grpc.RolloutServiceStub(connection)):
+                        return
+                waits = channel.backoffs()
+            except grpc.RpcError as error:
+                if error.code() not in _RETRIED:
+                    raise
+                log.warning("the learner is away", address=self._address, reason=error.details())
+            # Nothing to keep: whoever gets the tickets next plays the same episodes.
+            time.sleep(next(waits))
+
+    def _serve(self, learner: rollout_pb2_grpc.RolloutServiceStub) -> bool:
+        """Play over one stream until it ends; true if the run is complete."""
+        outgoing: queue.SimpleQueue[rollout_pb2.PlayRequest | None] = queue.SimpleQueue()
+        name, incarnation = self._hello
+        hello = rollout_pb2.Hello(
+            actor_id=name, incarnation=incarnation, env_spec_hash=self._player.spec.hash, build=build()
+        )
+        outgoing.put(rollout_pb2.PlayRequest(hello=hello))
+        outgoing.put(_NEXT_TICKET)
+        version, idle_since = -1, time.perf_counter()
+        for message in learner.Play(iter(outgoing.get, None), wait_for_ready=True):
+            match message.WhichOneof("body"):
+                case "policy":
+                    self._player.load(codec.decode_policy(message.policy, self._shapes))
+                    version = message.policy.version
+                case "ticket":
+                    outgoing.put(_NEXT_TICKET)  # so that the next one is here when this episode ends
+                    ticket = codec.decode_ticket(message.ticket)
+                    if ticket.policy_version != version:
+                        raise RuntimeError(f"got a ticket for policy {ticket.policy_version}, have {version}")
+                    begin = time.perf_counter()
+                    trajectory = self._player.play(ticket)
+                    end = time.perf_counter()
+                    stats = rollout_pb2.ActorStats(play_seconds=end - begin, wait_seconds=begin - idle_since)
+                    idle_since = end
+                    encoded = codec.encode_trajectory(trajectory, stats, self._compress)
+                    outgoing.put(rollout_pb2.PlayRequest(trajectory=encoded))
+                case "drain":
+                    outgoing.put(None)
+                    log.info("drained", reason=message.drain.reason)
+                    return bool(message.drain.run_complete)
+        return False

@@ -1,0 +1,101 @@
+"""The evaluator: tests every frozen checkpoint, in order, exactly once."""
+
+from __future__ import annotations
+
+import time
+
+import grpc
+import numpy as np
+import structlog
+
+from liir_common import checkpoint, metrics, seeds
+from liir_common.client import CheckpointClient
+from liir_common.config import Config
+from liir_common.rollout.player import Player
+from liir_common.rpc.channel import backoffs
+from liir_common.rpc.gen.liir.v1 import checkpoint_pb2
+from liir_common.types import Exploration, Ticket, Weights
+
+log = structlog.get_logger()
+
+_MODES = {"greedy": Exploration.GREEDY, "sampled": Exploration.SOFTMAX_FLOOR}
+
+
+def evaluate(
+    player: Player, weights: Weights, run_seed: int, episode: int, episodes: int, mode: str
+) -> checkpoint_pb2.EpisodeStats:
+    """Play the test episodes of one checkpoint with seeds that no training episode has.
+
+    `mode` is "greedy" (the best action every time) or "sampled" (drawn from the policy).
+    """
+    player.load(weights)
+    base = seeds.episode_seed(run_seed, seeds.EVALUATION, episode)
+    played = [
+        player.play(Ticket(index, 0, seeds.derive(base, index), _MODES[mode], 0.0))
+        for index in range(episodes)
+    ]
+    metrics.EVALUATION_EPISODES.labels(mode).inc(episodes)
+    return checkpoint_pb2.EpisodeStats(
+        episodes=len(played),
+        wins=sum(trajectory.info.get("won", 0.0) > 0 for trajectory in played),
+        return_mean=float(np.mean([trajectory.reward.sum() for trajectory in played])),
+        length_mean=float(np.mean([trajectory.length for trajectory in played])),
+        info_means={key: float(np.mean([t.info[key] for t in played])) for key in played[0].info},
+    )
+
+
+class Evaluator:
+    """Works through a learner's checkpoints and waits for more until the run is complete."""
+
+    def __init__(self, address: str, config: Config, player: Player) -> None:
+        """Test what the learner at `address` freezes."""
+        self._address = address
+        self._config = config
+        self._player = player
+
+    def run(self) -> None:
+        """Return when the run is complete and every checkpoint has its test.
+
+        Raises:
+            grpc.RpcError: the learner refused a call; to try again would not help.
+        """
+        waits = backoffs()
+        while True:
+            try:
+                with CheckpointClient(self._address, timeout_s=np.inf) as client:
+                    self._catch_up(client)
+                    return
+            except grpc.RpcError as error:
+                if error.code() != grpc.StatusCode.UNAVAILABLE:
+                    raise
+                log.warning("the learner is away", address=self._address, reason=error.details())
+            time.sleep(next(waits))
+
+    def _catch_up(self, client: CheckpointClient) -> None:
+        tested = {evaluation.episode for evaluation in client.evaluations()}
+        for frozen in client.watch():
+            if frozen.episode not in tested:
+                with metrics.EVALUATION_SECONDS.time():
+                    client.report(self._test(client, frozen))
+                metrics.EVALUATED_EPISODE.set(frozen.episode)
+
+    def _test(self, client: CheckpointClient, frozen: checkpoint_pb2.Checkpoint) -> checkpoint_pb2.Evaluation:
+        _, tensors = client.get(frozen.episode)
+        weights = checkpoint.section(tensors, "policy")
+        stats = {
+            mode: evaluate(
+                self._player,
+                weights,
+                self._config.seed,
+                frozen.episode,
+                self._config.evaluation.episodes,
+                mode,
+            )
+            for mode in _MODES
+        }
+        log.info(
+            "tested", episode=frozen.episode, wins=stats["greedy"].wins, sampled_wins=stats["sampled"].wins
+        )
+        return checkpoint_pb2.Evaluation(
+            episode=frozen.episode, sha256=frozen.sha256, env_steps=frozen.env_steps, **stats
+        )

@@ -1,0 +1,31 @@
+"""`liir learner`: the learner process."""
+
+import asyncio
+from pathlib import Path
+
+import typer
+
+from liir_common import logs, options
+from liir_common.errors import exit_on_error
+from liir_common.rollout.play import env_spec
+from services.learner.run_directory import RunDirectory
+from services.learner.service import serve
+
+
+def learner(
+    run_dir: options.RunDir = None,
+    config: options.ConfigFile = None,
+    settings: options.Settings = None,
+    resume: options.Resume = False,
+) -> None:
+    """Train a run: serve tickets to actors, checkpoints to evaluators."""
+    logs.configure("learner")
+    path = run_dir or Path("runs/learner")
+    with exit_on_error():
+        resolved = options.load_run_config(config, settings, path, resume)
+        spec = env_spec(resolved.env)
+        asyncio.run(serve(resolved, RunDirectory(path, resolved, spec), spec))
+
+
+if __name__ == "__main__":
+    typer.run(learner)

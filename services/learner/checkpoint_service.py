@@ -1,0 +1,199 @@
+"""Frozen checkpoints and their tests, served to evaluators and anybody else."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Mapping
+from typing import Any
+
+import grpc
+
+from liir_common import metrics
+from liir_common.checkpoint import Manifest
+from liir_common.errors import CorruptError
+from liir_common.rpc.gen.liir.v1 import checkpoint_pb2, checkpoint_pb2_grpc
+from liir_common.rpc.server import Refused
+from services.learner.run_directory import RunDirectory
+
+_CHUNK_BYTES = 64 * 1024
+_MAX_LIST = 1000
+
+
+class CheckpointService(checkpoint_pb2_grpc.CheckpointServiceServicer):
+    """Lives on the event loop; the run directory's tables are its own to write."""
+
+    def __init__(self, run: RunDirectory) -> None:
+        """Serve the checkpoints of `run`."""
+        self._run = run
+        self._changed = asyncio.Condition()
+        self._complete = False
+        self.evaluations = {
+            evaluation.episode: evaluation for evaluation in map(_from_row, run.evaluations.rows)
+        }
+        self._show_evaluations()
+
+    @property
+    def all_evaluated(self) -> bool:
+        """Whether every checkpoint so far has its test."""
+        return len(self.evaluations) == len(self._run.checkpoints.manifests)
+
+    async def changed(self) -> None:
+        """Wake the watchers: there is a new checkpoint or a new evaluation."""
+        async with self._changed:
+            self._changed.notify_all()
+
+    async def complete(self) -> None:
+        """No checkpoint will follow: watchers end when they have seen all."""
+        self._complete = True
+        await self.changed()
+
+    async def wait_all_evaluated(self) -> None:
+        """Return when every checkpoint has its test."""
+        async with self._changed:
+            await self._changed.wait_for(lambda: self.all_evaluated)
+
+    async def ListCheckpoints(
+        self, request: checkpoint_pb2.ListCheckpointsRequest, context: grpc.aio.ServicerContext
+    ) -> checkpoint_pb2.ListCheckpointsResponse:
+        """Checkpoints after a position, oldest first."""
+        found = [m for m in self._run.checkpoints.manifests if m.episode > request.after_episode]
+        return checkpoint_pb2.ListCheckpointsResponse(
+            checkpoints=map(_to_message, found[: _limit(request.limit)])
+        )
+
+    async def GetCheckpoint(
+        self, request: checkpoint_pb2.GetCheckpointRequest, context: grpc.aio.ServicerContext
+    ) -> AsyncIterator[checkpoint_pb2.GetCheckpointResponse]:
+        """A header, then the weights file from the asked offset on."""
+        manifest = self._find(request.episode)
+        try:
+            data = self._run.checkpoints.read(manifest)
+        except (CorruptError, OSError) as error:
+            raise Refused(grpc.StatusCode.DATA_LOSS, f"checkpoint {request.episode}: {error}") from None
+        if request.offset > len(data):
+            raise ValueError(f"offset: wanted 0..{len(data)}, got {request.offset}")
+        header = checkpoint_pb2.CheckpointHeader(
+            checkpoint=_to_message(manifest), manifest_json=manifest.to_json()
+        )
+        yield checkpoint_pb2.GetCheckpointResponse(header=header)
+        for start in range(request.offset, len(data), _CHUNK_BYTES):
+            yield checkpoint_pb2.GetCheckpointResponse(chunk=data[start : start + _CHUNK_BYTES])
+
+    async def WatchCheckpoints(
+        self, request: checkpoint_pb2.WatchCheckpointsRequest, context: grpc.aio.ServicerContext
+    ) -> AsyncIterator[checkpoint_pb2.WatchCheckpointsResponse]:
+        """Every checkpoint after a position, in order, until the run is complete."""
+        manifests = self._run.checkpoints.manifests
+        seen = sum(manifest.episode <= request.after_episode for manifest in manifests)
+        while True:
+            while seen < len(manifests):
+                yield checkpoint_pb2.WatchCheckpointsResponse(checkpoint=_to_message(manifests[seen]))
+                seen += 1
+            if self._complete:
+                return
+            async with self._changed:
+                # The trainer appends before it notifies, so this cannot sleep through a checkpoint.
+                if seen == len(manifests) and not self._complete:
+                    await self._changed.wait()
+
+    async def ReportEvaluation(
+        self, request: checkpoint_pb2.ReportEvaluationRequest, context: grpc.aio.ServicerContext
+    ) -> checkpoint_pb2.ReportEvaluationResponse:
+        """Store the test of a checkpoint, once."""
+        evaluation = request.evaluation
+        manifest = self._find(evaluation.episode)
+        _check(evaluation, manifest)
+        if evaluation.episode in self.evaluations:
+            return checkpoint_pb2.ReportEvaluationResponse(duplicate=True)
+        self._run.evaluations.append(_to_row(evaluation, manifest, self._run.created))
+        self.evaluations[evaluation.episode] = evaluation
+        self._show_evaluations()
+        await self.changed()
+        return checkpoint_pb2.ReportEvaluationResponse(duplicate=False)
+
+    async def ListEvaluations(
+        self, request: checkpoint_pb2.ListEvaluationsRequest, context: grpc.aio.ServicerContext
+    ) -> checkpoint_pb2.ListEvaluationsResponse:
+        """Evaluations after a position, oldest checkpoint first."""
+        episodes = sorted(episode for episode in self.evaluations if episode > request.after_episode)
+        return checkpoint_pb2.ListEvaluationsResponse(
+            evaluations=[self.evaluations[episode] for episode in episodes[: _limit(request.limit)]]
+        )
+
+    def _find(self, episode: int) -> Manifest:
+        try:
+            return self._run.checkpoints.find(episode)
+        except KeyError:
+            message = f"no checkpoint of episode {episode}; ListCheckpoints says which there are"
+            raise Refused(grpc.StatusCode.NOT_FOUND, message) from None
+
+    def _show_evaluations(self) -> None:
+        metrics.EVALUATIONS.set(len(self.evaluations))
+        if not self.evaluations:
+            return
+        newest = self.evaluations[max(self.evaluations)]
+        metrics.EVALUATED_ENV_STEPS.set(newest.env_steps)
+        for actions in ("greedy", "sampled"):
+            stats = getattr(newest, actions)
+            metrics.WIN_RATE.labels(self._run.config.env.map, actions).set(stats.wins / stats.episodes)
+
+
+def _limit(asked: int) -> int:
+    return min(asked or _MAX_LIST, _MAX_LIST)
+
+
+def _to_message(manifest: Manifest) -> checkpoint_pb2.Checkpoint:
+    return checkpoint_pb2.Checkpoint(
+        episode=manifest.episode,
+        policy_version=manifest.policy_version,
+        env_steps=manifest.env_steps,
+        sha256=manifest.sha256,
+        size_bytes=manifest.size_bytes,
+    )
+
+
+def _check(evaluation: checkpoint_pb2.Evaluation, manifest: Manifest) -> None:
+    if evaluation.sha256 != manifest.sha256:
+        raise ValueError(f"evaluation: wanted one of SHA-256 {manifest.sha256}, got {evaluation.sha256!r}")
+    for name in ("greedy", "sampled"):
+        stats = getattr(evaluation, name)
+        if not 0 <= stats.wins <= stats.episodes or stats.episodes == 0:
+            raise ValueError(f"{name}: wanted 0 <= wins <= episodes > 0, got {stats.wins}/{stats.episodes}")
+
+
+def _to_row(evaluation: checkpoint_pb2.Evaluation, manifest: Manifest, begin: float) -> dict[str, Any]:
+    row: dict[str, Any] = {
+        "episode": evaluation.episode,
+        "env_steps": manifest.env_steps,
+        "policy_version": manifest.policy_version,
+        "seconds": manifest.created - begin,
+        "sha256": evaluation.sha256,
+    }
+    for name in ("greedy", "sampled"):
+        stats = getattr(evaluation, name)
+        row |= {
+            f"{name}_episodes": stats.episodes,
+            f"{name}_wins": stats.wins,
+            f"{name}_win_rate": stats.wins / stats.episodes,
+            f"{name}_return_mean": stats.return_mean,
+            f"{name}_length_mean": stats.length_mean,
+        }
+        row |= {f"{name}_{key}_mean": stats.info_means[key] for key in sorted(stats.info_means)}
+    return row
+
+
+def _from_row(row: Mapping[str, str]) -> checkpoint_pb2.Evaluation:
+    evaluation = checkpoint_pb2.Evaluation(
+        episode=int(row["episode"]), sha256=row["sha256"], env_steps=int(row["env_steps"])
+    )
+    for name in ("greedy", "sampled"):
+        stats = getattr(evaluation, name)
+        stats.episodes, stats.wins = int(row[f"{name}_episodes"]), int(row[f"{name}_wins"])
+        stats.return_mean = float(row[f"{name}_return_mean"])
+        stats.length_mean = float(row[f"{name}_length_mean"])
+        plain = {"return", "length"}
+        for key, value in row.items():
+            figure = key.removeprefix(f"{name}_").removesuffix("_mean")
+            if key == f"{name}_{figure}_mean" and figure not in plain:
+                stats.info_means[figure] = float(value)
+    return evaluation

@@ -1,0 +1,127 @@
+"""The run directory: everything a run leaves on disk, and what it needs to go on.
+
+config.yaml      the resolved configuration
+run.json         run id, build, environment
+endpoints.json   where the learner listens while it runs
+state/           the learner's own state at the last saves
+checkpoints/     frozen checkpoints
+metrics.csv      one row per learner step
+evaluations.csv  one row per tested checkpoint
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+import uuid
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import structlog
+import yaml
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from liir_common.build import build, git_commit
+from liir_common.checkpoint import CheckpointStore
+from liir_common.config import Config
+from liir_common.errors import ConfigError, CorruptError
+from liir_common.files import Table, write_atomic
+from liir_common.types import EnvSpec
+
+log = structlog.get_logger()
+
+_STATES_KEPT = 2
+
+
+@dataclass(frozen=True)
+class Counters:
+    """How far a run is."""
+
+    learner_step: int = 0
+    env_steps: int = 0
+    episodes: int = 0
+
+
+class RunDirectory:
+    """One run on disk; the learner owns it."""
+
+    def __init__(self, path: Path, config: Config, spec: EnvSpec) -> None:
+        """Begin a run at `path`, or go on with the one that is there.
+
+        Raises:
+            ConfigError: the run that is there plays another environment.
+        """
+        self.path = path
+        self.config = config
+        self.spec = spec
+        (path / "state").mkdir(parents=True, exist_ok=True)
+        if not (path / "run.json").exists():
+            self._write_json("run.json", {"run_id": uuid.uuid4().hex, "created": time.time()})
+        record = json.loads((path / "run.json").read_text())
+        if record.get("env_spec_hash", spec.hash) != spec.hash:
+            raise ConfigError(
+                f"{path} was trained on {record['env_spec']}, this build and configuration play "
+                f"{asdict(spec)}; resume with the simulator and env section that began it"
+            )
+        self.run_id: str = record["run_id"]
+        self.created: float = record["created"]
+        self._write_json(
+            "run.json",
+            record
+            | {"env_spec_hash": spec.hash, "env_spec": asdict(spec), "build": build(), "git": git_commit()},
+        )
+        write_atomic(path / "config.yaml", yaml.safe_dump(config.tree(), sort_keys=False).encode())
+        self.checkpoints = CheckpointStore(str(path / "checkpoints"))
+        self.metrics = Table(path / "metrics.csv")
+        self.evaluations = Table(path / "evaluations.csv")
+
+    def write_endpoints(self, endpoints: Mapping[str, Any]) -> None:
+        """Say where this learner listens, for whoever starts the other processes."""
+        self._write_json("endpoints.json", {**endpoints, "pid": os.getpid()})
+
+    def save_state(self, counters: Counters, tensors: Mapping[str, Tensor], notes: Mapping[str, Any]) -> None:
+        """Keep what the learner needs to go on after `counters.learner_step`; older states but one go."""
+        metadata = {"counters": json.dumps(asdict(counters)), "notes": json.dumps(notes)}
+        contiguous = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+        write_atomic(self._state_path(counters.learner_step), save(contiguous, metadata))
+        for old in self._state_paths()[:-_STATES_KEPT]:
+            old.unlink()
+
+    def load_state(self) -> tuple[Counters, dict[str, Tensor], dict[str, Any]] | None:
+        """The newest state that can be read, or nothing if the run never saved one.
+
+        Raises:
+            CorruptError: there are states, and none of them can be read.
+        """
+        paths = self._state_paths()
+        for path in reversed(paths):
+            try:
+                with safe_open(path, framework="pt") as file:
+                    metadata = file.metadata()
+                    tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+                counters = Counters(**json.loads(metadata["counters"]))
+                return counters, tensors, json.loads(metadata["notes"])
+            except (SafetensorError, KeyError, TypeError, ValueError) as error:
+                log.error(
+                    "a saved state cannot be read; trying the one before", path=str(path), error=str(error)
+                )
+        if paths:
+            raise CorruptError(
+                f"no state under {self.path / 'state'} can be read; restore one from a backup, or remove "
+                "them all to train from the start"
+            )
+        return None
+
+    def _state_path(self, step: int) -> Path:
+        return self.path / "state" / f"state-{step:09d}.safetensors"
+
+    def _state_paths(self) -> list[Path]:
+        return sorted((self.path / "state").glob("state-*.safetensors"))
+
+    def _write_json(self, name: str, value: Mapping[str, Any]) -> None:
+        write_atomic(self.path / name, json.dumps(value, indent=1).encode())

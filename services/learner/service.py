@@ -1,0 +1,110 @@
+"""The learner process: gRPC on the event loop, training in a thread, one graceful way to end."""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+from collections.abc import Awaitable
+
+import structlog
+import torch
+
+from liir_common import metrics, seeds
+from liir_common.config import Config
+from liir_common.rpc.gen.liir.v1 import (
+    checkpoint_pb2_grpc,
+    rollout_pb2_grpc,
+    training_pb2,
+    training_pb2_grpc,
+)
+from liir_common.rpc.server import Server
+from liir_common.types import EnvSpec, Weights
+from services.learner.algorithms import make_algorithm
+from services.learner.checkpoint_service import CheckpointService
+from services.learner.intake import Opening
+from services.learner.rollout_service import RolloutService
+from services.learner.run_directory import RunDirectory
+from services.learner.trainer import Trainer
+from services.learner.training_service import TrainingService
+
+log = structlog.get_logger()
+
+_DRAIN_GRACE_S = 5.0
+_STOP_GRACE_S = 2.0
+
+
+async def serve(config: Config, run: RunDirectory, spec: EnvSpec) -> None:
+    """Train until the run is complete and its checkpoints are tested, or until asked to stop."""
+    loop = asyncio.get_running_loop()
+    server = Server(config.learner.host, config.learner.port, config.learner.insecure)
+    metrics_port = metrics.serve(config.learner.metrics_port, "learner.metrics_port")
+    algorithm = make_algorithm(
+        spec, config.algorithm, seeds.derive(config.seed, seeds.LEARNER), device(config.learner.device)
+    )
+    log.info("parameters", **algorithm.parameter_counts())
+
+    def publish(opening: Opening, weights: Weights) -> None:
+        loop.call_soon_threadsafe(rollouts.publish, opening, weights)
+
+    def frozen() -> None:
+        asyncio.run_coroutine_threadsafe(checkpoints.changed(), loop)
+
+    trainer = Trainer(run, algorithm, publish, frozen)
+    rollouts = RolloutService(config, spec, algorithm.exploration, trainer.next_batch, trainer.batches)
+    checkpoints = CheckpointService(run)
+    stopping = asyncio.Event()
+
+    def stop(reason: str) -> None:
+        log.info("stopping", reason=reason)
+        stopping.set()
+        trainer.stop()
+
+    training = TrainingService(run, trainer.progress, rollouts, checkpoints, stop)
+    rollout_pb2_grpc.add_RolloutServiceServicer_to_server(rollouts, server.grpc)
+    checkpoint_pb2_grpc.add_CheckpointServiceServicer_to_server(checkpoints, server.grpc)
+    training_pb2_grpc.add_TrainingServiceServicer_to_server(training, server.grpc)
+    for signum in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(signum, stop, signum.name)
+
+    await server.start()
+    run.write_endpoints(
+        {"address": f"{config.learner.host}:{server.port}", "metrics": f"127.0.0.1:{metrics_port}"}
+    )
+    log.info("serving", address=f"{config.learner.host}:{server.port}", run=str(run.path))
+    expiry = asyncio.create_task(rollouts.expire_tickets())
+    try:
+        await _first_of(asyncio.to_thread(trainer.run), expiry)
+        if trainer.complete and config.evaluation.enabled and not stopping.is_set():
+            trainer.progress.phase = training_pb2.PHASE_EVALUATING
+            await _first_of(checkpoints.wait_all_evaluated(), stopping.wait(), expiry)
+    finally:
+        expiry.cancel()
+        await _leave(server, trainer, rollouts, checkpoints)
+
+
+async def _leave(
+    server: Server, trainer: Trainer, rollouts: RolloutService, checkpoints: CheckpointService
+) -> None:
+    """Say goodbye in the order that lets every peer end cleanly."""
+    trainer.progress.phase = training_pb2.PHASE_STOPPING
+    await server.not_serving()
+    await rollouts.drain("the learner ends", trainer.complete, _DRAIN_GRACE_S)
+    if trainer.complete:
+        await checkpoints.complete()
+    await server.stop(_STOP_GRACE_S)
+    log.info("ended", run_complete=trainer.complete, learner_step=trainer.progress.counters.learner_step)
+
+
+async def _first_of(*awaitables: Awaitable[object]) -> None:
+    """Wait for the first to end, and raise what it raised."""
+    tasks = [asyncio.ensure_future(awaitable) for awaitable in awaitables]
+    done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+    for task in done:
+        task.result()
+
+
+def device(name: str) -> torch.device:
+    """The device to train on: "auto" takes a GPU when there is one."""
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() else "cpu"
+    return torch.device(name)

@@ -1,0 +1,237 @@
+"""The training loop: batches in, learner steps, policies and checkpoints out. Runs in a thread of its own."""
+
+from __future__ import annotations
+
+import hashlib
+import queue
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+
+import numpy as np
+import structlog
+import torch
+from torch import Tensor
+
+from liir_common import metrics
+from liir_common.build import git_commit
+from liir_common.checkpoint import Manifest, pack
+from liir_common.rpc.gen.liir.v1 import training_pb2
+from liir_common.types import Batch, Trajectory, Weights
+from services.learner.algorithms import Algorithm
+from services.learner.intake import Opening
+from services.learner.run_directory import Counters, RunDirectory
+
+log = structlog.get_logger()
+
+Batches = queue.SimpleQueue[list[Trajectory] | None]
+"""Complete batches in order; None wakes a trainer that was told to stop."""
+
+
+@dataclass
+class Progress:
+    """What the trainer is doing; written by its thread, read by any."""
+
+    phase: training_pb2.Phase = training_pb2.PHASE_COLLECTING
+    counters: Counters = field(default_factory=Counters)
+    newest: Mapping[str, float] = field(default_factory=dict)
+    """Metrics of the newest learner step."""
+    recent: deque[tuple[float, int]] = field(default_factory=lambda: deque(maxlen=50))
+    """(time, environment steps) of the last learner steps."""
+
+    @property
+    def env_steps_per_second(self) -> float:
+        """Rate over the last learner steps."""
+        if len(self.recent) < 2:
+            return 0.0
+        (t0, n0), (t1, n1) = self.recent[0], self.recent[-1]
+        return (n1 - n0) / (t1 - t0)
+
+
+class Trainer:
+    """Makes learner steps until the run has its environment steps, or until told to stop."""
+
+    def __init__(
+        self,
+        run: RunDirectory,
+        algorithm: Algorithm,
+        publish: Callable[[Opening, Weights], None],
+        frozen: Callable[[], None],
+    ) -> None:
+        """Go on where the run directory's state stands.
+
+        `publish` is called for each batch that may be played, `frozen` after each new checkpoint.
+        """
+        self.run_directory = run
+        self.config = run.config
+        self.algorithm = algorithm
+        self.batches: Batches = queue.SimpleQueue()
+        self.progress = Progress()
+        self._publish = publish
+        self._frozen = frozen
+        self._stopping = False
+        self._openings: deque[tuple[Opening, Weights]] = deque()
+        self._restore()
+
+    @property
+    def complete(self) -> bool:
+        """Whether the run has all its environment steps."""
+        return self.progress.counters.env_steps >= self.config.training.total_env_steps
+
+    @property
+    def next_batch(self) -> int:
+        """The batch that the next learner step takes."""
+        return self.progress.counters.learner_step
+
+    def stop(self) -> None:
+        """End after the learner step under way."""
+        self._stopping = True
+        self.batches.put(None)
+
+    def run(self) -> None:
+        """Train; the state is saved when this returns."""
+        torch.set_num_threads(self.config.learner.threads)
+        for opening, weights in () if self.complete else self._openings:
+            self._publish(opening, weights)
+        while not (self._stopping or self.complete) and self._step():
+            pass
+        self._save()
+
+    def _step(self) -> bool:
+        progress = self.progress
+        progress.phase = training_pb2.PHASE_COLLECTING
+        with _timed("collect") as collect:
+            trajectories = self.batches.get()
+        if trajectories is None:
+            return False
+        progress.phase = training_pb2.PHASE_UPDATING
+        opening, _ = self._openings.popleft()
+        with _timed("update") as update:
+            batch = Batch.from_trajectories(trajectories, opening.epsilon)
+            figures = self.algorithm.update(batch)
+        before = progress.counters
+        progress.counters = Counters(
+            before.learner_step + 1, before.env_steps + batch.env_steps, before.episodes + len(trajectories)
+        )
+        self._open(before.learner_step + 1 + self.config.training.lag)
+        with _timed("record"):
+            seconds = {"collect_s": collect.seconds, "update_s": update.seconds}
+            self._record(opening, trajectories, figures | seconds)
+            self._freeze(before.episodes)
+            if progress.counters.learner_step % self.config.training.save_interval == 0:
+                self._save()
+        return True
+
+    def _open(self, batch: int) -> None:
+        """Let the actors play `batch` with the newest policy, unless the run is complete.
+
+        Even then the opening is kept, so that a run resumed with more steps goes on as if never ended.
+        """
+        counters = self.progress.counters
+        epsilon = self.config.algorithm.exploration.epsilon(counters.env_steps)
+        opening = Opening(batch, counters.learner_step, epsilon)
+        weights = self.algorithm.policy()
+        self._openings.append((opening, weights))
+        if not self.complete:
+            self._publish(opening, weights)
+
+    def _record(self, opening: Opening, trajectories: list[Trajectory], figures: Mapping[str, float]) -> None:
+        counters, progress = self.progress.counters, self.progress
+        now = time.time()
+        episode_figures = {
+            "return_mean": float(np.mean([t.reward.sum() for t in trajectories])),
+            "length_mean": float(np.mean([t.length for t in trajectories])),
+            **{
+                f"{key}_mean": float(np.mean([t.info[key] for t in trajectories]))
+                for key in trajectories[0].info
+            },
+        }
+        policy = {
+            "policy_lag": counters.learner_step - 1 - opening.policy_version,
+            "epsilon": opening.epsilon,
+        }
+        progress.newest = {**episode_figures, **policy, **figures}
+        progress.recent.append((now, counters.env_steps))
+        row = {**asdict(counters), "time": now, **progress.newest}
+        self.run_directory.metrics.append(row)
+        steps = sum(t.length for t in trajectories)
+        metrics.ENV_STEPS.labels(self.config.env.map).inc(steps)
+        metrics.EPISODES.labels(self.config.env.map).inc(len(trajectories))
+        metrics.LEARNER_STEP.set(counters.learner_step)
+        metrics.EPISODE_RETURN.set(episode_figures["return_mean"])
+        metrics.EPISODE_LENGTH.set(episode_figures["length_mean"])
+        metrics.POLICY_LAG.set(policy["policy_lag"])
+        for name, value in figures.items():
+            metrics.TRAINING_METRIC.labels(name).set(value)
+
+    def _freeze(self, episodes_before: int) -> None:
+        """One checkpoint for every multiple of the interval that this step's episodes crossed."""
+        interval, counters = self.config.training.checkpoint_interval, self.progress.counters
+        first = (episodes_before // interval + 1) * interval
+        for episode in range(first, counters.episodes + 1, interval):
+            weights = {f"policy.{name}": array for name, array in self.algorithm.policy().items()}
+            intrinsic = {f"intrinsic.{name}": array for name, array in self.algorithm.intrinsic().items()}
+            data = pack(weights | intrinsic)
+            manifest = Manifest(
+                episode=episode,
+                policy_version=counters.learner_step,
+                env_steps=counters.env_steps,
+                run_id=self.run_directory.run_id,
+                git_commit=git_commit(),
+                env_spec=asdict(self.run_directory.spec),
+                config=self.config.tree(),
+                created=time.time(),
+                sha256=hashlib.sha256(data).hexdigest(),
+                size_bytes=len(data),
+            )
+            if self.run_directory.checkpoints.publish(manifest, data):
+                metrics.CHECKPOINT_TIME.set(manifest.created)
+            metrics.CHECKPOINTS.set(len(self.run_directory.checkpoints.manifests))
+            self._frozen()
+
+    def _save(self) -> None:
+        """Keep everything the next learner step depends on."""
+        tensors = {f"algorithm.{name}": tensor for name, tensor in self.algorithm.state().items()}
+        for opening, weights in self._openings:
+            for name, array in weights.items():
+                tensors[f"opening.{opening.batch}.{name}"] = torch.from_numpy(array)
+        notes = {"openings": [asdict(opening) for opening, _ in self._openings]}
+        self.run_directory.save_state(self.progress.counters, tensors, notes)
+
+    def _restore(self) -> None:
+        saved = self.run_directory.load_state()
+        if saved is None:
+            counters = Counters()
+            for batch in range(self.config.training.lag + 1):
+                epsilon = self.config.algorithm.exploration.epsilon(0)
+                self._openings.append((Opening(batch, 0, epsilon), self.algorithm.policy()))
+        else:
+            counters, tensors, notes = saved
+            self.algorithm.load_state(_section(tensors, "algorithm."))
+            for fields in notes["openings"]:
+                weights = _section(tensors, f"opening.{fields['batch']}.")
+                numpy_weights = {name: tensor.numpy() for name, tensor in weights.items()}
+                self._openings.append((Opening(**fields), numpy_weights))
+            log.info("resumed", **asdict(counters))
+        self.progress.counters = counters
+        self.run_directory.metrics.keep("learner_step", counters.learner_step)
+
+
+def _section(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    return {name.removeprefix(prefix): t for name, t in tensors.items() if name.startswith(prefix)}
+
+
+@dataclass
+class _Timer:
+    seconds: float = 0.0
+
+
+@contextmanager
+def _timed(phase: str) -> Iterator[_Timer]:
+    timer = _Timer()
+    begin = time.perf_counter()
+    yield timer
+    timer.seconds = time.perf_counter() - begin
+    metrics.PHASE_SECONDS.labels(phase).observe(timer.seconds)

@@ -1,0 +1,39 @@
+"""Made-up environments and episodes for tests that need the shapes, not the game."""
+
+import numpy as np
+
+from liir_common.types import EnvSpec, Trajectory
+
+SPEC = EnvSpec(
+    name="sample",
+    version="1",
+    options="{}",
+    n_agents=2,
+    n_actions=4,
+    obs_dim=5,
+    state_dim=3,
+    episode_limit=9,
+    info_keys=("won", "score"),
+)
+
+
+def make_trajectory(episode_id: int = 0, version: int = 0, length: int = 6, spec: EnvSpec = SPEC) -> Trajectory:
+    """An episode that could have been played: random, but the same for the same arguments."""
+    random = np.random.default_rng([episode_id, version, length])
+    shape = (length + 1, spec.n_agents)
+    mask = random.random((*shape, spec.n_actions)) < 0.5
+    mask[..., 1] = True
+    return Trajectory(
+        episode_id=episode_id,
+        policy_version=version,
+        obs=random.standard_normal((*shape, spec.obs_dim)).astype(np.float32),
+        state=random.standard_normal((length + 1, spec.state_dim)).astype(np.float32),
+        mask=mask,
+        alive=np.ones(shape, np.bool_),
+        actions=np.ones((length, spec.n_agents), np.int16),
+        log_mu=np.log(random.uniform(0.1, 1, (length, spec.n_agents))).astype(np.float32),
+        reward=random.standard_normal(length).astype(np.float32),
+        terminated=length < spec.episode_limit,
+        truncated=length == spec.episode_limit,
+        info={"won": float(episode_id % 2), "score": 0.5},
+    )

@@ -1,0 +1,95 @@
+"""Frozen checkpoints: immutable, digested, there completely or not at all."""
+
+from dataclasses import replace
+from hashlib import sha256
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from liir_common import checkpoint
+from liir_common.checkpoint import CheckpointStore, Manifest
+from liir_common.errors import CorruptError
+
+TENSORS = {"policy.fc1.bias": np.arange(4, dtype=np.float32), "intrinsic.w": np.ones((2, 3), np.float32)}
+DATA = checkpoint.pack(TENSORS)
+
+
+def make_manifest(episode: int, data: bytes = DATA) -> Manifest:
+    return Manifest(
+        episode=episode,
+        policy_version=3,
+        env_steps=1000,
+        run_id="run",
+        git_commit="abc",
+        env_spec={"name": "sample"},
+        config={"seed": 1},
+        created=1.0,
+        sha256=sha256(data).hexdigest(),
+        size_bytes=len(data),
+    )
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> CheckpointStore:
+    return CheckpointStore(str(tmp_path / "checkpoints"))
+
+
+def test_equal_tensors_give_equal_bytes_in_any_order() -> None:
+    assert checkpoint.pack(dict(reversed(TENSORS.items()))) == DATA
+
+
+def test_published_checkpoints_are_found_by_a_new_store(store: CheckpointStore, tmp_path: Path) -> None:
+    for episode in (100, 200):
+        assert store.publish(make_manifest(episode), DATA)
+    again = CheckpointStore(str(tmp_path / "checkpoints"))
+    assert [manifest.episode for manifest in again.manifests] == [100, 200]
+    manifest = again.find(200)
+    assert manifest == make_manifest(200)
+    tensors = checkpoint.unpack(again.read(manifest), manifest.sha256)
+    assert np.array_equal(checkpoint.section(tensors, "policy")["fc1.bias"], TENSORS["policy.fc1.bias"])
+    assert list(checkpoint.section(tensors, "intrinsic")) == ["w"]
+
+
+def test_stores_beyond_the_local_disk_work_too() -> None:
+    store = CheckpointStore("memory://run/checkpoints")
+    store.publish(make_manifest(100), DATA)
+    again = CheckpointStore("memory://run/checkpoints")
+    assert again.read(again.find(100)) == DATA
+
+
+def test_the_same_checkpoint_again_is_a_no_op_and_another_an_error(store: CheckpointStore) -> None:
+    store.publish(make_manifest(100), DATA)
+    assert not store.publish(replace(make_manifest(100), created=2.0), DATA)
+    assert store.find(100).created == 1.0
+    other = checkpoint.pack({"policy.fc1.bias": np.zeros(4, np.float32)})
+    with pytest.raises(CorruptError, match="checkpoint 100 exists with SHA-256"):
+        store.publish(make_manifest(100, other), other)
+
+
+def test_a_damaged_weights_file_is_never_read(store: CheckpointStore, tmp_path: Path) -> None:
+    store.publish(make_manifest(100), DATA)
+    path = tmp_path / "checkpoints" / "checkpoint-000000100.safetensors"
+    path.write_bytes(DATA[:-1] + b"\xff")
+    with pytest.raises(CorruptError, match="wanted SHA-256"):
+        store.read(store.find(100))
+
+
+def test_a_damaged_manifest_is_named(store: CheckpointStore, tmp_path: Path) -> None:
+    store.publish(make_manifest(100), DATA)
+    (tmp_path / "checkpoints" / "checkpoint-000000100.json").write_text("{")
+    with pytest.raises(CorruptError, match=r"checkpoint-000000100\.json"):
+        CheckpointStore(str(tmp_path / "checkpoints"))
+
+
+def test_weights_without_a_manifest_do_not_exist(store: CheckpointStore, tmp_path: Path) -> None:
+    (tmp_path / "checkpoints" / "checkpoint-000000100.safetensors").write_bytes(DATA)
+    assert CheckpointStore(str(tmp_path / "checkpoints")).manifests == []
+    with pytest.raises(KeyError, match="no checkpoint of episode 100"):
+        store.find(100)
+
+
+def test_bytes_that_are_no_weights_file_are_refused() -> None:
+    garbage = b"\x05\0\0\0\0\0\0\0hello"
+    with pytest.raises(CorruptError, match="not a safetensors"):
+        checkpoint.unpack(garbage, sha256(garbage).hexdigest())

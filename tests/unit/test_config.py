@@ -1,0 +1,86 @@
+"""The configuration: sources in order, presets, and errors that say what to do."""
+
+from pathlib import Path
+
+import pytest
+
+from liir_common import config
+from liir_common.errors import ConfigError
+
+
+def test_command_line_beats_environment_beats_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "run.yaml"
+    file.write_text("seed: 3\ntraining: {total_env_steps: 10, batch_episodes: 4, save_interval: 9}\n")
+    monkeypatch.setenv("LIIR_TRAINING__BATCH_EPISODES", "5")
+    monkeypatch.setenv("LIIR_TRAINING__SAVE_INTERVAL", "7")
+    resolved = config.load(file, ["training.save_interval=2"])
+    assert resolved.seed == 3
+    assert resolved.training.total_env_steps == 10
+    assert resolved.training.batch_episodes == 5
+    assert resolved.training.save_interval == 2
+
+
+def test_preset_fills_what_is_not_written() -> None:
+    paper = config.load(None, ["preset=paper", "algorithm.gae_lambda=0"])
+    assert paper.algorithm.policy_optimizer.name == "rmsprop"
+    assert paper.algorithm.gae_lambda == 0
+    assert paper.env.options["reward_only_positive"] is False
+    strong = config.load()
+    assert strong.algorithm.policy_optimizer.name == "adam"
+    assert strong.env.options["reward_only_positive"] is True
+
+
+def test_algorithm_may_be_its_name() -> None:
+    assert config.load(None, ["algorithm=central_v"]).algorithm.name == "central_v"
+
+
+def test_tree_round_trip_ignores_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    resolved = config.load(None, ["seed=9", "algorithm.lambda=0.5"])
+    monkeypatch.setenv("LIIR_SEED", "1")
+    assert config.from_tree(resolved.tree()) == resolved
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("trainig.lag=1", "did you mean 'training'"),
+        ("training.lagg=1", "did you mean 'lag'"),
+        ("algorithm.lamda=1", "did you mean 'lambda'"),
+        ("training.lag=2", "training.lag: Input should be less than or equal to 1; got 2"),
+        ("training.total_env_steps=many", "training.total_env_steps"),
+        ("preset=strongest", "'strong', 'paper' or 'none'"),
+        ("seed", "--set wants key.sub=value, got 'seed'"),
+        ("seed=[", "not YAML"),
+    ],
+)
+def test_mistakes_are_explained(setting: str, message: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        config.load(None, [setting])
+    assert message in str(caught.value)
+
+
+def test_unreadable_files_are_explained(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="cannot read"):
+        config.load(tmp_path / "missing.yaml")
+    bad = tmp_path / "bad.yaml"
+    bad.write_text("- a\n- b\n")
+    with pytest.raises(ConfigError, match="wanted a mapping"):
+        config.load(bad)
+    bad.write_text("a: [")
+    with pytest.raises(ConfigError, match="not YAML"):
+        config.load(bad)
+
+
+def test_exploration_falls_linearly_and_stays() -> None:
+    exploration = config.ExplorationConfig(start=0.5, end=0.1, steps=100)
+    assert exploration.epsilon(0) == 0.5
+    assert exploration.epsilon(50) == pytest.approx(0.3)
+    assert exploration.epsilon(1000) == pytest.approx(0.1)
+    assert config.ExplorationConfig(start=0.5, end=0.1, steps=0).epsilon(0) == pytest.approx(0.1)
+
+
+def test_every_shipped_configuration_loads() -> None:
+    files = sorted(Path("configs").glob("*.yaml"))
+    assert files
+    for file in files:
+        config.load(file)

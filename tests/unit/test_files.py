@@ -1,0 +1,55 @@
+"""Files that survive whoever dies while writing them."""
+
+from pathlib import Path
+
+import pytest
+
+from liir_common.files import Table, write_atomic
+
+
+def test_a_failed_write_leaves_the_old_content_and_nothing_else(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "file"
+    write_atomic(path, b"old")
+
+    def full_disk(_: int) -> None:
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr("os.fsync", full_disk)
+    with pytest.raises(OSError, match="no space"):
+        write_atomic(path, b"new")
+    assert path.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_table_goes_on_where_it_was(tmp_path: Path) -> None:
+    path = tmp_path / "table.csv"
+    table = Table(path)
+    table.append({"step": 1, "x": 0.5})
+    table.append({"step": 2, "x": 1.5})
+    again = Table(path)
+    again.append({"step": 3, "x": 2.5})
+    assert path.read_text().splitlines() == ["step,x", "1,0.5", "2,1.5", "3,2.5"]
+    assert again.rows == Table(path).rows
+
+
+def test_a_half_written_row_is_dropped(tmp_path: Path) -> None:
+    path = tmp_path / "table.csv"
+    Table(path).append({"step": 1, "x": 0.5})
+    with path.open("a") as file:
+        file.write("2")
+    table = Table(path)
+    assert [row["step"] for row in table.rows] == ["1"]
+    table.append({"step": 2, "x": 1.5})
+    assert path.read_text().splitlines() == ["step,x", "1,0.5", "2,1.5"]
+
+
+def test_keep_drops_what_a_resumed_run_writes_again(tmp_path: Path) -> None:
+    path = tmp_path / "table.csv"
+    table = Table(path)
+    for step in range(1, 6):
+        table.append({"step": step})
+    table.keep("step", 3)
+    table.append({"step": 4})
+    assert path.read_text().splitlines() == ["step", "1", "2", "3", "4"]

@@ -27,7 +27,7 @@ _DOWNLOAD_TRIES = 5
 class CheckpointClient:
     """Lists, downloads and watches the checkpoints of one learner."""
 
-    def __init__(self, address: str, timeout_s: float = 30.0) -> None:
+    def __init__(self, address: str, timeout_s: float | None = 30.0) -> None:
         """Connect to the learner at HOST:PORT.
 
         Raises:
@@ -119,7 +119,7 @@ class CheckpointClient:
 class TrainingClient:
     """Asks a learner about its run."""
 
-    def __init__(self, address: str, timeout_s: float = 30.0) -> None:
+    def __init__(self, address: str, timeout_s: float | None = 30.0) -> None:
         """Connect to the learner at HOST:PORT.
 
         Raises:

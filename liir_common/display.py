@@ -89,10 +89,34 @@ class LogLines:
         """Write a line if it is time for one."""
         if time.monotonic() >= self._next:
             self._next = time.monotonic() + _LINE_EVERY_S
-            log.info("training", **{k.replace(" ", "_"): v for k, v in rows(status, evaluations).items()})
+            log.info("training", **_figures(status, evaluations))
 
     def close(self) -> None:
         """Nothing to undo."""
+
+
+def _figures(
+    status: training_pb2.GetStatusResponse, evaluations: Sequence[checkpoint_pb2.Evaluation]
+) -> dict[str, object]:
+    """What a log line holds."""
+    shown = ("return_mean", "length_mean", "policy_lag", "reward_ratio")
+    figures: dict[str, object] = {
+        "phase": _PHASES.get(status.phase, "starting"),
+        "env_steps": status.env_steps,
+        "total_env_steps": status.total_env_steps,
+        "env_steps_per_second": round(status.env_steps_per_second),
+        "learner_step": status.learner_step,
+        "episodes": status.episodes,
+        "actors": status.actors,
+        "checkpoints": status.checkpoints,
+        "evaluations": status.evaluations,
+        **{name: round(status.metrics[name], 4) for name in shown if name in status.metrics},
+    }
+    if evaluations:
+        newest = evaluations[-1]
+        figures["greedy_win_rate"] = newest.greedy.wins / newest.greedy.episodes
+        figures["sampled_win_rate"] = newest.sampled.wins / newest.sampled.episodes
+    return figures
 
 
 def rows(
@@ -106,7 +130,7 @@ def rows(
         "env steps": f"{status.env_steps:,} of {status.total_env_steps:,}, {rate:,.0f}/s",
         "learner step": f"{status.learner_step:,} ({status.episodes:,} episodes, lag {lag:.0f})",
         "return": f"{newest['return_mean']:.2f} over {newest['length_mean']:.0f} steps an episode",
-        "intrinsic / extrinsic": f"{newest['intrinsic_ratio']:.3f}" if "intrinsic_ratio" in newest else "–",
+        "intrinsic / extrinsic": f"{newest['reward_ratio']:.3f}" if "reward_ratio" in newest else "–",
         "win rate": _win_rates(evaluations),
         "checkpoints": f"{status.evaluations:,} of {status.checkpoints:,} tested",
         "actors": f"{status.actors} ({status.tickets_outstanding} tickets out)",

@@ -1,5 +1,6 @@
 """Command-line options that several commands share."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -19,6 +20,13 @@ RunDir = Annotated[
 ]
 Resume = Annotated[bool, typer.Option("--resume", help="Go on with the run in the run directory.")]
 Learner = Annotated[str, typer.Option("--learner", help="HOST:PORT of the learner.")]
+
+
+def run(command: Callable[..., None]) -> None:
+    """Run a process's only command."""
+    app = typer.Typer(pretty_exceptions_enable=False, add_completion=False)
+    app.command()(command)
+    app()
 
 
 def load_run_config(

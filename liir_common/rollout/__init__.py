@@ -1,0 +1,1 @@
+"""Playing episodes: policy kernel, fused battle episode, generic PettingZoo loop; no torch, ray or gRPC."""

@@ -41,8 +41,8 @@ CHANNEL_OPTIONS = (
 )
 
 
-def connect(address: str, timeout_s: float = 30.0) -> grpc.Channel:
-    """A channel to the learner at HOST:PORT, once it answers.
+def connect(address: str, timeout_s: float | None = 30.0) -> grpc.Channel:
+    """A channel to the learner at HOST:PORT, once it answers; with no time-out it waits for ever.
 
     Raises:
         UnreachableError: nobody answered within `timeout_s`.

@@ -4,7 +4,6 @@ import signal
 import sys
 
 import ray
-import typer
 
 from liir_common import config, logs, metrics, options
 from liir_common.client import TrainingClient
@@ -32,4 +31,4 @@ def actors(learner: options.Learner, settings: options.Settings = None) -> None:
 
 
 if __name__ == "__main__":
-    typer.run(actors)
+    options.run(actors)

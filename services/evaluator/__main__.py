@@ -3,8 +3,6 @@
 import signal
 import sys
 
-import typer
-
 from liir_common import config, logs, metrics, options
 from liir_common.client import TrainingClient
 from liir_common.errors import exit_on_error
@@ -26,4 +24,4 @@ def evaluator(learner: options.Learner, settings: options.Settings = None) -> No
 
 
 if __name__ == "__main__":
-    typer.run(evaluator)
+    options.run(evaluator)

@@ -62,7 +62,7 @@ class Evaluator:
         waits = backoffs()
         while True:
             try:
-                with CheckpointClient(self._address, timeout_s=np.inf) as client:
+                with CheckpointClient(self._address, timeout_s=None) as client:
                     self._catch_up(client)
                     return
             except grpc.RpcError as error:

@@ -3,8 +3,6 @@
 import asyncio
 from pathlib import Path
 
-import typer
-
 from liir_common import logs, options
 from liir_common.errors import exit_on_error
 from liir_common.rollout.play import env_spec
@@ -28,4 +26,4 @@ def learner(
 
 
 if __name__ == "__main__":
-    typer.run(learner)
+    options.run(learner)

@@ -15,6 +15,7 @@ from pathlib import Path
 import psutil
 
 from liir_common.checkpoint import CheckpointStore
+from liir_common.config import Config, load
 
 LIIR = str(Path(sys.executable).with_name("liir"))
 TIMEOUT_S = 180.0
@@ -114,3 +115,8 @@ def digests(run_dir: Path) -> dict[int, str]:
     """SHA-256 of every checkpoint's weights, by episode."""
     store = CheckpointStore(str(run_dir / "checkpoints"))
     return {manifest.episode: manifest.sha256 for manifest in store.manifests}
+
+
+def config(*settings: str) -> Config:
+    """The configuration of a small run."""
+    return load(None, (*SMALL, *settings))

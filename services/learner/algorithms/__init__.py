@@ -1,0 +1,66 @@
+"""The learning rules, each in one file that reads beside its paper."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from liir_common.config import AlgorithmConfig
+from liir_common.types import Batch, EnvSpec, Exploration
+from services.learner.algorithms.central_v import CentralV
+from services.learner.algorithms.liir import Liir
+
+
+class Algorithm(Protocol):
+    """What the learner needs of a learning rule. Not thread-safe: one thread calls it."""
+
+    exploration: Exploration
+    """How actors choose actions"""
+
+    def policy(self) -> dict[str, NDArray[np.float32]]:
+        """Copies of the policy's weights under the names and shapes of `policy_shapes`."""
+
+    def intrinsic(self) -> dict[str, NDArray[np.float32]]:
+        """Copies of the weights of the intrinsic reward; empty if the method has none."""
+
+    def update(self, batch: Batch) -> dict[str, float]:
+        """One learner step; returns figures by name, those without a value in this batch left out.
+
+        Raises:
+            ValueError: the batch does not fit; nothing has changed then.
+            FloatingPointError: learning has diverged.
+        """
+
+    def state(self) -> dict[str, torch.Tensor]:
+        """Copies, on the CPU, of everything that `update` depends on."""
+
+    def load_state(self, state: Mapping[str, torch.Tensor]) -> None:
+        """Go on from `state`, bit for bit as if never stopped.
+
+        Raises:
+            ValueError: names, shapes or dtypes differ; nothing has changed then.
+        """
+
+    def parameter_counts(self) -> dict[str, int]:
+        """Number of parameters of theta, eta, phi and varphi, and the budget of the last three."""
+
+
+_METHODS: Mapping[str, Callable[[EnvSpec, AlgorithmConfig, int, torch.device, torch.dtype], Algorithm]] = {
+    "liir": Liir,
+    "central_v": CentralV,
+}
+
+
+def make_algorithm(
+    spec: EnvSpec,
+    config: AlgorithmConfig,
+    seed: int,
+    device: torch.device,
+    dtype: torch.dtype = torch.float32,
+) -> Algorithm:
+    """The method `config.name` for environment `spec`, initialised from `seed` alone (0 <= seed < 2**64)."""
+    return _METHODS[config.name](spec, config, seed, device, dtype)

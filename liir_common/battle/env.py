@@ -1,0 +1,316 @@
+"""The battle as a PettingZoo parallel environment."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, TypedDict
+
+import numpy as np
+from gymnasium.spaces import Box, Dict, Discrete
+from numpy.typing import NDArray
+from pettingzoo.utils.env import ParallelEnv
+
+from liir_common.battle import engine
+from liir_common.battle.observation import observe
+from liir_common.battle.parameters import resolve
+from liir_common.battle.policies import make_buffers
+from liir_common.battle.render import draw_ansi, draw_rgb
+from liir_common.battle.scenarios import TERRAINS, find_scenario
+from liir_common.battle.tables import build_battle, build_tables, roster
+from liir_common.types import EnvSpec
+
+INFO_KEYS = ("won", "dead_allies", "dead_enemies")
+_STATUS_OF_INFO = {
+    "won": engine.WON,
+    "dead_allies": engine.DEAD_ALLIES,
+    "dead_enemies": engine.DEAD_ENEMIES,
+}
+
+Observation = dict[str, NDArray[Any]]
+
+
+class UnitRecord(TypedDict):
+    """One unit as plain values, for people and tests."""
+
+    team: str
+    """"ally" or "enemy" """
+    id: int
+    """Number within the team"""
+    unit_type: str
+    x: float
+    y: float
+    health: float
+    health_max: float
+    shield: float
+    shield_max: float
+    energy: float
+    cooldown: float
+    """Loops until the weapon may fire"""
+    radius: float
+    alive: bool
+    order: str
+    """One of `engine.ORDERS`"""
+    target: int | None
+    """Number of the unit attacked, within the other team"""
+
+
+class AvailableActions(Discrete):
+    """Discrete actions of which `sample` without a mask draws one that is available now."""
+
+    def __init__(self, available: NDArray[np.int8]) -> None:
+        super().__init__(len(available))
+        self.available = available
+        """[A], owned and kept up to date by the environment"""
+
+    def sample(
+        self, mask: NDArray[np.int8] | None = None, probability: NDArray[Any] | None = None
+    ) -> np.int64:
+        """One action; at random among the available ones unless a mask or probabilities say otherwise."""
+        if mask is None and probability is None:
+            mask = self.available
+        return super().sample(mask, probability)
+
+
+class BattleEnv(ParallelEnv[str, Observation, int]):  # type: ignore[misc]  # PettingZoo is untyped
+    """Micromanagement battle with SMAC v1's rules, actions, observations and rewards.
+
+    Agents stay listed until the episode ends; a dead one has the no-op as its only action, and
+    `info["alive"]` says so. All agents get the team's reward.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {
+        "name": "battle_v1",
+        "render_modes": ["ansi", "rgb_array"],
+        "render_fps": 2.8,
+        "is_parallelizable": True,
+    }
+
+    def __init__(self, map_name: str, render_mode: str | None = None, **options: Any) -> None:
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ValueError(f"render_mode wants one of {self.metadata['render_modes']}, got {render_mode!r}")
+        scenario, settings = find_scenario(map_name), resolve(options)
+        self.render_mode = render_mode
+        self._unit_types = [unit.name for unit in roster(scenario, settings)[0]]
+        self._tables = build_tables(scenario, settings, TERRAINS[scenario.terrain])
+        self._battle = build_battle(self._tables)
+        self._buffers = make_buffers(self._tables)
+        n, n_actions = self._buffers.mask.shape
+        self._masks = np.zeros((n, n_actions), np.int8)
+        self.possible_agents = [f"ally_{i}" for i in range(n)]
+        self.agents: list[str] = []
+        self.action_spaces = {a: AvailableActions(self._masks[i]) for i, a in enumerate(self.possible_agents)}
+        self.observation_spaces = {a: self._observation_space() for a in self.possible_agents}
+        self.state_space = Box(-np.inf, np.inf, self._buffers.state.shape, np.float32)
+
+    def _observation_space(self) -> Dict:
+        obs, mask = self._buffers.obs[0], self._masks[0]
+        return Dict(
+            {"observation": Box(-1, 1, obs.shape, np.float32), "action_mask": Box(0, 1, mask.shape, np.int8)}
+        )
+
+    def observation_space(self, agent: str) -> Dict:
+        """The observation in [-1, 1] and the action mask of one agent."""
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> AvailableActions:
+        """SMAC v1's actions: no-op, stop, north, south, east, west, attack enemy 0, 1, ..."""
+        return self.action_spaces[agent]
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Observation], dict[str, dict[str, Any]]]:
+        """Start an episode.
+
+        Args:
+            seed: 64-bit seed that determines the whole episode; None takes a random one.
+            options: part of PettingZoo's signature; the battle has none.
+
+        Raises:
+            ValueError: the seed does not fit 64 bits.
+        """
+        seed = secrets.randbits(64) if seed is None else seed
+        if not 0 <= seed < 2**64:
+            raise ValueError(f"a seed wants an integer in [0, 2**64), got {seed!r}")
+        engine.reset(self._tables, self._battle, np.uint64(seed))
+        self.agents = list(self.possible_agents)
+        self._observe()
+        return self._observations(), self._infos()
+
+    def step(
+        self, actions: Mapping[str, int]
+    ) -> tuple[
+        dict[str, Observation], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]
+    ]:
+        """Play one step of eight game loops.
+
+        Raises:
+            RuntimeError: no episode is running.
+            ValueError: an agent's action is missing or not available.
+        """
+        if not self.agents:
+            raise RuntimeError("no episode is running; call reset() before step()")
+        reward = engine.step(self._tables, self._battle, self._checked(actions))
+        self._observe()
+        status = self._battle.status
+        results = (
+            self._observations(),
+            dict.fromkeys(self.agents, float(reward)),
+            dict.fromkeys(self.agents, bool(status[engine.TERMINATED])),
+            dict.fromkeys(self.agents, bool(status[engine.TRUNCATED])),
+            self._infos(),
+        )
+        if status[engine.TERMINATED] or status[engine.TRUNCATED]:
+            self.agents = []
+        return results
+
+    def _checked(self, actions: Mapping[str, int]) -> NDArray[np.int64]:
+        if set(actions) != set(self.agents):
+            raise ValueError(f"step wants one action for each of {self.agents}, got {sorted(actions)}")
+        for agent, mask in zip(self.agents, self._masks, strict=True):
+            if not (actions[agent] in self.action_spaces[agent] and mask[actions[agent]]):
+                raise ValueError(
+                    f"action {actions[agent]!r} of {agent} is not available; "
+                    f"its mask allows {np.flatnonzero(mask).tolist()}"
+                )
+        return np.array([actions[agent] for agent in self.agents], np.int64)
+
+    def state(self) -> NDArray[np.float32]:
+        """SMAC v1's global state [S]."""
+        return self._buffers.state.copy()
+
+    def snapshot(self) -> list[UnitRecord]:
+        """All units as plain records, allies first."""
+        return [self._record(i) for i in range(len(self._unit_types))]
+
+    def restore(self, snapshot: Sequence[UnitRecord]) -> None:
+        """Put units into the recorded situation and end attacks, missiles and walks that are under way.
+
+        Raises:
+            ValueError: other units than the map's, or a unit where no unit can be.
+        """
+        expected = [self._identity(self._record(i)) for i in range(len(self._unit_types))]
+        got = [self._identity(record) for record in snapshot]
+        if got != expected:
+            raise ValueError(f"this map wants the units {expected}, got {got}")
+        for i, record in enumerate(snapshot):
+            self._put(i, record)
+        alive = self._battle.units["alive"]
+        n = len(self.possible_agents)
+        self._battle.status[engine.DEAD_ALLIES] = n - alive[:n].sum()
+        self._battle.status[engine.DEAD_ENEMIES] = len(alive) - n - alive[n:].sum()
+        self._observe()
+
+    @staticmethod
+    def _identity(record: UnitRecord) -> tuple[str, int, str]:
+        return record["team"], record["id"], record["unit_type"]
+
+    def _record(self, i: int) -> UnitRecord:
+        unit, spec, n = self._battle.units[i], self._tables.specs[i], len(self.possible_agents)
+        is_ally, target = i < n, int(unit["target"])
+        return UnitRecord(
+            team="ally" if is_ally else "enemy",
+            id=i if is_ally else i - n,
+            unit_type=self._unit_types[i],
+            x=float(self._battle.x[i]),
+            y=float(self._battle.y[i]),
+            health=float(unit["health"]),
+            health_max=float(spec["health"]),
+            shield=float(unit["shield"]),
+            shield_max=float(spec["shield"]),
+            energy=float(unit["energy"]),
+            cooldown=max(0.0, float(unit["ready_at"] - self._battle.clock[0])),
+            radius=float(spec["radius"]),
+            alive=bool(unit["alive"]),
+            order=engine.ORDERS[unit["order"]],
+            target=None if target < 0 else target - n if is_ally else target,
+        )
+
+    def _put(self, i: int, record: UnitRecord) -> None:
+        unit, spec, n = self._battle.units[i], self._tables.specs[i], len(self.possible_agents)
+        x, y, now = record["x"], record["y"], self._battle.clock[0]
+        inside = 0 <= x < self._tables.pathing.shape[0] and 0 <= y < self._tables.pathing.shape[1]
+        if not (inside and self._tables.pathing[int(x), int(y)]):
+            raise ValueError(
+                f"{record['team']} {record['id']} wants a place that units can reach, got {x, y}"
+            )
+        if not (0 <= record["health"] <= spec["health"] and 0 <= record["shield"] <= spec["shield"]):
+            raise ValueError(
+                f"{record['team']} {record['id']} wants health in [0, {spec['health']}] and shield in "
+                f"[0, {spec['shield']}], got {record['health']} and {record['shield']}"
+            )
+        if record["alive"] != (record["health"] > 0):
+            raise ValueError(f"{record['team']} {record['id']}: alive wants to mean health above 0")
+        if record["order"] not in engine.ORDERS:
+            raise ValueError(f"order wants one of {engine.ORDERS}, got {record['order']!r}")
+        self._battle.x[i], self._battle.y[i] = x, y
+        unit["health"], unit["shield"], unit["energy"] = record["health"], record["shield"], record["energy"]
+        unit["alive"], unit["order"] = record["alive"], engine.ORDERS.index(record["order"])
+        unit["ready_at"], unit["free_at"], unit["hits"] = now + record["cooldown"], now, 0
+        if i < n:
+            unit["goal_x"], unit["goal_y"] = x, y
+        target = record["target"]
+        unit["target"] = -1 if target is None else target + n if i < n else target
+        unit["attacker"] = unit["missile_target"] = -1
+
+    def render(self) -> str | NDArray[np.uint8] | None:
+        """The battlefield as text ("ansi") or as an image [H, W, 3] ("rgb_array")."""
+        if self.render_mode == "ansi":
+            return draw_ansi(self.snapshot(), self._tables.pathing)
+        if self.render_mode == "rgb_array":
+            return draw_rgb(self.snapshot(), self._tables.pathing)
+        return None
+
+    def _observe(self) -> None:
+        observe(self._tables, self._battle, *self._buffers)
+        self._masks[:] = self._buffers.mask
+
+    def _observations(self) -> dict[str, Observation]:
+        return {
+            agent: {"observation": obs.copy(), "action_mask": mask.copy()}
+            for agent, obs, mask in zip(self.agents, self._buffers.obs, self._masks, strict=True)
+        }
+
+    def _infos(self) -> dict[str, dict[str, Any]]:
+        status = self._battle.status
+        ended = status[engine.TERMINATED] or status[engine.TRUNCATED]
+        outcome = {key: float(status[at]) for key, at in _STATUS_OF_INFO.items()} if ended else {}
+        return {
+            agent: {"alive": bool(alive), **outcome}
+            for agent, alive in zip(self.agents, self._buffers.alive, strict=True)
+        }
+
+
+def parallel_env(map_name: str, render_mode: str | None = None, **options: Any) -> BattleEnv:
+    """Make a battle.
+
+    Args:
+        map_name: one of `scenarios.SCENARIOS`.
+        render_mode: None, "ansi" or "rgb_array".
+        options: fields of `parameters.Settings`.
+
+    Raises:
+        ValueError: an unknown map or option, or an illegal value.
+    """
+    return BattleEnv(map_name, render_mode, **options)
+
+
+def battle_spec(map_name: str, **options: Any) -> EnvSpec:
+    """What `parallel_env` and `make_battle` with the same arguments look like from outside.
+
+    Raises:
+        ValueError: an unknown map or option, or an illegal value.
+    """
+    scenario, settings = find_scenario(map_name), resolve(options)
+    rules = build_tables(scenario, settings, TERRAINS[scenario.terrain]).rules[0]
+    return EnvSpec(
+        name=f"battle/{map_name}",
+        version=engine.SIMULATOR_VERSION,
+        options=settings.canonical(),
+        n_agents=int(rules["n_allies"]),
+        n_actions=int(rules["n_actions"]),
+        obs_dim=int(rules["obs_dim"]),
+        state_dim=int(rules["state_dim"]),
+        episode_limit=scenario.limit,
+        info_keys=INFO_KEYS,
+    )

@@ -1,0 +1,121 @@
+"""Scripted policies in compiled code, and whole episodes played with them: for calibration and benchmarks."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from liir_common import rng, seeds
+from liir_common.battle.engine import (
+    DEAD_ALLIES,
+    DEAD_ENEMIES,
+    NO_OP,
+    NORTH,
+    STEPS,
+    STOP,
+    TERMINATED,
+    TRUNCATED,
+    WON,
+    reset,
+    step,
+)
+from liir_common.battle.observation import observe
+from liir_common.battle.tables import FIRST_ATTACK, Tables, inlined
+
+RANDOM, STAND, STEP_ASIDE, CLOSEST_ENEMY = range(4)
+"""Uniform over available actions; stop; north as long as possible; SMAC v1's built-in heuristic."""
+
+
+class Buffers(NamedTuple):
+    """Where one situation of a battle is written."""
+
+    obs: NDArray[np.float32]
+    """[n, O]"""
+    state: NDArray[np.float32]
+    """[S]"""
+    mask: NDArray[np.bool_]
+    """[n, A]"""
+    alive: NDArray[np.bool_]
+    """[n]"""
+
+
+def make_buffers(tables: Tables) -> Buffers:
+    """Buffers of the sizes that `observation.observe` fills."""
+    n, actions, obs_dim, state_dim = (
+        int(tables.rules[name][0]) for name in ("n_allies", "n_actions", "obs_dim", "state_dim")
+    )
+    return Buffers(
+        np.zeros((n, obs_dim), np.float32),
+        np.zeros(state_dim, np.float32),
+        np.zeros((n, actions), np.bool_),
+        np.zeros(n, np.bool_),
+    )
+
+
+@njit(cache=True, nogil=True)
+def play_episodes(tables, battle, buffers, policy, first_seed, outcomes):
+    """Play one episode per row of outcomes [E, 5]: length, return, won, dead allies, dead enemies."""
+    actions = np.zeros(len(buffers.alive), np.int64)
+    targets = np.zeros(len(buffers.alive), np.int64)
+    stream = np.zeros(1, np.uint64)
+    for episode in range(len(outcomes)):
+        seed = rng.derive(first_seed, episode)
+        stream[0] = rng.derive(seed, seeds.POLICY)
+        reset(tables, battle, seed)
+        observe(tables, battle, buffers.obs, buffers.state, buffers.mask, buffers.alive)
+        targets[:] = -1
+        total = 0.0
+        while not (battle.status[TERMINATED] or battle.status[TRUNCATED]):
+            if policy == RANDOM:
+                _act_randomly(buffers.mask, stream, actions)
+            elif policy == CLOSEST_ENEMY:
+                _attack_closest(tables, battle, targets, actions)
+            else:
+                _act_always(NORTH if policy == STEP_ASIDE else STOP, buffers.mask, actions)
+            total += step(tables, battle, actions)
+            observe(tables, battle, buffers.obs, buffers.state, buffers.mask, buffers.alive)
+        outcomes[episode, 0] = battle.status[STEPS]
+        outcomes[episode, 1] = total
+        outcomes[episode, 2] = battle.status[WON]
+        outcomes[episode, 3] = battle.status[DEAD_ALLIES]
+        outcomes[episode, 4] = battle.status[DEAD_ENEMIES]
+
+
+@inlined
+def _act_randomly(mask, stream, actions):
+    for i in range(len(actions)):
+        available = 0
+        for a in range(mask.shape[1]):
+            available += mask[i, a]
+        skip = np.int64(rng.uniform(stream) * available)
+        for a in range(mask.shape[1]):
+            if mask[i, a]:
+                if skip == 0:
+                    actions[i] = a
+                    break
+                skip -= 1
+
+
+@inlined
+def _act_always(action, mask, actions):
+    for i in range(len(actions)):
+        actions[i] = action if mask[i, action] else (NO_OP if mask[i, NO_OP] else STOP)
+
+
+@inlined
+def _attack_closest(tables, battle, targets, actions):
+    """Attack the enemy nearest when the last one died, from any distance: availability does not bind it."""
+    n_allies = tables.rules[0].n_allies
+    for i in range(n_allies):
+        if not battle.units[i].alive:
+            actions[i] = NO_OP
+            continue
+        if targets[i] < 0 or not battle.units[n_allies + targets[i]].alive:
+            nearest2 = np.inf
+            for j in range(tables.rules[0].n_enemies):
+                enemy = n_allies + j
+                distance2 = (battle.x[enemy] - battle.x[i]) ** 2 + (battle.y[enemy] - battle.y[i]) ** 2
+                if battle.units[enemy].alive and distance2 < nearest2:
+                    nearest2, targets[i] = distance2, j
+        actions[i] = FIRST_ATTACK + targets[i]

@@ -1,0 +1,78 @@
+"""Battle episodes as one compiled call: simulator, policy and sampling without Python in between."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from liir_common.battle.engine import DEAD_ALLIES, DEAD_ENEMIES, TERMINATED, TRUNCATED, WON, reset, step
+from liir_common.battle.env import battle_spec
+from liir_common.battle.observation import observe
+from liir_common.battle.scenarios import make_battle
+from liir_common.rollout.player import Ending, Player
+from liir_common.rollout.policy import Choice, Policy, act, first_stuck, stuck_message
+
+
+def source_files() -> list[Path]:
+    """All code that an episode is compiled from, beside this file."""
+    package = Path(__file__).parents[1]
+    own = [package / name for name in ("rng.py", "seeds.py", "rollout/policy.py")]
+    return own + sorted((package / "battle").glob("*.py"))
+
+
+def _sources() -> str:
+    return hashlib.sha256(b"".join(file.read_bytes() for file in source_files())).hexdigest()
+
+
+def _compile(sources: str) -> Any:
+    # numba's cache notices changes of this file only; a variable of the closure is part of its key,
+    # so a change of the simulator is never answered with the episode compiled before it.
+    @njit(cache=True, nogil=True)
+    def play_episode(tables, battle, policy, hidden, rows, seed, choice):
+        """Fill `rows`; return the number of steps, and the agent without an action at the end or -1."""
+        sources  # noqa: B018
+        chosen = np.full(len(hidden), -1)
+        t = 0
+        reset(tables, battle, seed)
+        observe(tables, battle, rows.obs[t], rows.state[t], rows.mask[t], rows.alive[t])
+        stuck = first_stuck(rows.mask[t])
+        while stuck < 0 and not (battle.status[TERMINATED] or battle.status[TRUNCATED]):
+            act(policy, hidden, rows.obs[t], chosen, rows.mask[t], choice, chosen, rows.log_mu[t])
+            rows.actions[t] = chosen
+            rows.reward[t] = step(tables, battle, chosen)
+            t += 1
+            observe(tables, battle, rows.obs[t], rows.state[t], rows.mask[t], rows.alive[t])
+            stuck = first_stuck(rows.mask[t])
+        return t, stuck
+
+    return play_episode
+
+
+_play_episode = _compile(_sources())
+
+
+class FusedPlayer(Player):
+    """Plays battles on one map; the interpreter is free for other threads meanwhile."""
+
+    def __init__(self, map_name: str, options: dict[str, Any], policy_hidden: int) -> None:
+        super().__init__(battle_spec(map_name, **options), policy_hidden)
+        self._tables, self._battle = make_battle(map_name, **options)
+
+    def _run(self, policy: Policy, seed: int, choice: Choice) -> Ending:
+        length, stuck = _play_episode(
+            self._tables, self._battle, policy, self._hidden, self._rows, np.uint64(seed), choice
+        )
+        if stuck >= 0:
+            raise ValueError(stuck_message(stuck, length))
+        status = self._battle.status
+        figures = {"won": WON, "dead_allies": DEAD_ALLIES, "dead_enemies": DEAD_ENEMIES}
+        return Ending(
+            length,
+            bool(status[TERMINATED]),
+            bool(status[TRUNCATED]),
+            {key: float(status[figures[key]]) for key in self.spec.info_keys},
+        )

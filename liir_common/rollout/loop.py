@@ -1,0 +1,174 @@
+"""Episodes of any PettingZoo ParallelEnv whose agents share one reward, stepped in Python."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from pettingzoo import ParallelEnv
+
+from liir_common.rollout.player import Ending, Player
+from liir_common.rollout.policy import Choice, Policy, act, first_stuck, stuck_message
+from liir_common.types import EnvSpec, FloatArray
+
+Env = ParallelEnv[str, Any, Any]
+NO_OP = 0
+"""The action of an agent that left the game."""
+
+
+class LoopPlayer(Player):
+    """Plays through the PettingZoo interface.
+
+    Observations are a Box, or a Dict of "observation" and "action_mask". An agent that leaves
+    `env.agents` is dead: it observes zeros and has only action 0. An env that keeps its dead listed
+    says so with info["alive"].
+    """
+
+    def __init__(self, env: Env, spec: EnvSpec, policy_hidden: int) -> None:
+        super().__init__(spec, policy_hidden)
+        self._env = env
+        self._agents = env.possible_agents
+
+    def _run(self, policy: Policy, seed: int, choice: Choice) -> Ending:
+        env, rows = self._env, self._rows
+        chosen = np.full(self.spec.n_agents, -1)
+        observations, infos = env.reset(seed=seed)
+        self._look(0, observations, infos)
+        for t in range(self.spec.episode_limit):
+            act(policy, self._hidden, rows.obs[t], chosen, rows.mask[t], choice, chosen, rows.log_mu[t])
+            rows.actions[t] = chosen
+            actions = dict(zip(self._agents, chosen.tolist(), strict=True))
+            observations, rewards, terminations, truncations, infos = env.step(
+                {agent: actions[agent] for agent in env.agents}
+            )
+            rows.reward[t] = _team_reward(rewards, t)
+            self._look(t + 1, observations, infos)
+            if not env.agents:
+                return self._ending(t + 1, terminations, truncations, infos)
+        raise ValueError(
+            f"{self.spec.name}: wanted an end within the episode limit of {self.spec.episode_limit} steps, "
+            f"but {env.agents} are still listed; correct the limit that the environment states"
+        )
+
+    def _ending(
+        self,
+        length: int,
+        terminations: Mapping[str, bool],
+        truncations: Mapping[str, bool],
+        infos: Mapping[str, Mapping[str, Any]],
+    ) -> Ending:
+        """The game decided the end if it did so for all who were left."""
+        terminated, truncated = all(terminations.values()), any(truncations.values())
+        if not terminated and not truncated:
+            raise ValueError(
+                f"{self.spec.name}: env.agents is empty after {length} steps, but not all agents were "
+                f"terminated or truncated: {dict(terminations)}, {dict(truncations)}"
+            )
+        last = next(iter(infos.values()))
+        missing = [key for key in self.spec.info_keys if key not in last]
+        if missing:
+            raise ValueError(f"{self.spec.name}: the last info wants {missing}, got {sorted(last)}")
+        info = {key: float(last[key]) for key in self.spec.info_keys}
+        return Ending(length, bool(terminated), bool(truncated), info)
+
+    def _look(self, step: int, observations: Mapping[str, Any], infos: Mapping[str, Any]) -> None:
+        """Write what the team sees before `step`."""
+        # PettingZoo empties env.agents when the episode ends, also of those who lived to see it.
+        present = self._env.agents or observations
+        for i, agent in enumerate(self._agents):
+            if agent in present:
+                self._look_as(i, step, observations[agent], infos[agent])
+            else:
+                self._look_dead(i, step)
+        if not np.isfinite(self._rows.obs[step]).all():
+            raise ValueError(f"step {step}: wanted finite observations, got {self._rows.obs[step]}")
+        stuck = first_stuck(self._rows.mask[step])
+        if stuck >= 0:
+            raise ValueError(stuck_message(stuck, step))
+        self._rows.state[step] = _state(self._env, self._rows.obs[step])
+
+    def _look_as(self, i: int, step: int, observation: Any, info: Mapping[str, Any]) -> None:
+        if isinstance(observation, Mapping):
+            self._rows.obs[step, i] = np.ravel(observation["observation"])
+            self._rows.mask[step, i] = observation["action_mask"]
+        else:
+            self._rows.obs[step, i] = np.ravel(observation)
+            self._rows.mask[step, i] = True
+        self._rows.alive[step, i] = info.get("alive", True)
+
+    def _look_dead(self, i: int, step: int) -> None:
+        self._rows.obs[step, i] = 0
+        self._rows.mask[step, i] = np.arange(self.spec.n_actions) == NO_OP
+        self._rows.alive[step, i] = False
+
+
+def _team_reward(rewards: Mapping[str, float], step: int) -> float:
+    if len(set(rewards.values())) != 1:
+        raise ValueError(
+            f"step {step}: wanted one team reward, the same for all agents, got {dict(rewards)}; "
+            "give every agent the sum or the mean"
+        )
+    return next(iter(rewards.values()))
+
+
+def _state(env: Env, obs: FloatArray) -> FloatArray:
+    """[S], the state, or all observations in a row where the environment has none."""
+    try:
+        return np.asarray(env.state(), np.float32).ravel()
+    except NotImplementedError:
+        return obs.ravel()
+
+
+def loop_spec(env: Env, name: str, options: Mapping[str, Any]) -> EnvSpec:
+    """What `env` looks like from outside; it is reset once to see the size of its state.
+
+    The step limit is the attribute `episode_limit` of the unwrapped environment, or `max_cycles`, as
+    PettingZoo's own environments call it; `info_keys`, if there, names the figures of the last info;
+    the version is the name in the metadata, which ends in one.
+
+    Raises:
+        ValueError: agents differ in their spaces, a space is of an unsupported kind, or no limit is
+            stated.
+    """
+    game = env.unwrapped
+    limit = getattr(game, "episode_limit", getattr(game, "max_cycles", None))
+    if limit is None:
+        raise ValueError(f"{name}: wanted the most steps it plays as attribute episode_limit or max_cycles")
+    sizes = {agent: (_obs_dim(env, agent), _n_actions(env, agent)) for agent in env.possible_agents}
+    if len(set(sizes.values())) != 1:
+        raise ValueError(f"{name}: wanted equal (observation, action) sizes for all agents, got {sizes}")
+    obs_dim, n_actions = next(iter(sizes.values()))
+    env.reset(seed=0)
+    observations = np.zeros((len(sizes), obs_dim), np.float32)
+    return EnvSpec(
+        name=name,
+        version=str(env.metadata.get("name", type(game).__name__)),
+        options=json.dumps(dict(options), sort_keys=True, separators=(",", ":")),
+        n_agents=len(sizes),
+        n_actions=n_actions,
+        obs_dim=obs_dim,
+        state_dim=len(_state(env, observations)),
+        episode_limit=int(limit),
+        info_keys=tuple(getattr(game, "info_keys", ())),
+    )
+
+
+def _obs_dim(env: Env, agent: str) -> int:
+    space = env.observation_space(agent)
+    if isinstance(space, spaces.Dict) and {"observation", "action_mask"} <= space.keys():
+        space = space["observation"]
+    if not isinstance(space, spaces.Box):
+        raise ValueError(
+            f"{agent}: wanted a Box, or a Dict of observation and action_mask, to observe; got {space}"
+        )
+    return int(np.prod(space.shape))
+
+
+def _n_actions(env: Env, agent: str) -> int:
+    space = env.action_space(agent)
+    if not isinstance(space, spaces.Discrete) or space.start != 0:
+        raise ValueError(f"{agent}: wanted Discrete actions that start at 0, got {space}")
+    return int(space.n)

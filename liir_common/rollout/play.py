@@ -1,0 +1,64 @@
+"""From the configuration of an environment to what plays it."""
+
+from __future__ import annotations
+
+import importlib
+
+from pettingzoo import ParallelEnv
+
+from liir_common import seeds
+from liir_common.battle.env import battle_spec, parallel_env
+from liir_common.config import ConfigError, EnvConfig
+from liir_common.rollout.fused import FusedPlayer
+from liir_common.rollout.loop import Env, LoopPlayer, loop_spec
+from liir_common.rollout.player import Player
+from liir_common.rollout.policy import random_weights
+from liir_common.types import EnvSpec, Exploration, Ticket
+
+
+def env_spec(env: EnvConfig) -> EnvSpec:
+    """What the configured environment looks like from outside.
+
+    Raises:
+        ConfigError: the factory cannot be imported or does not return a ParallelEnv.
+        ValueError: the map or an option is unknown, or the environment is of an unsupported kind.
+    """
+    if env.kind == "battle":
+        return battle_spec(env.map, **env.options)
+    return loop_spec(_make(env), env.factory, env.options)
+
+
+def make_player(env: EnvConfig, policy_hidden: int = 64, fused: bool = True) -> Player:
+    """A player for policies with `policy_hidden` units; `fused=False` steps a battle in Python as well.
+
+    Raises:
+        ConfigError, ValueError: as `env_spec`.
+    """
+    if env.kind == "battle" and fused:
+        return FusedPlayer(env.map, env.options, policy_hidden)
+    if env.kind == "battle":
+        return LoopPlayer(parallel_env(env.map, **env.options), env_spec(env), policy_hidden)
+    game = _make(env)
+    return LoopPlayer(game, loop_spec(game, env.factory, env.options), policy_hidden)
+
+
+def _make(env: EnvConfig) -> Env:
+    module, colon, function = env.factory.partition(":")
+    if not (module and colon and function):
+        raise ConfigError(f"env.factory: wanted module:function, got {env.factory!r}")
+    try:
+        factory = getattr(importlib.import_module(module), function)
+    except (ImportError, AttributeError) as error:
+        raise ConfigError(f"env.factory: cannot import {env.factory!r}: {error}") from error
+    game = factory(**env.options)
+    if not isinstance(game, ParallelEnv):
+        raise ConfigError(f"env.factory: {env.factory!r} wants to return a ParallelEnv, got {game!r}")
+    return game
+
+
+def warm_up(env: EnvConfig) -> None:
+    """Compile all that playing `env` needs, into numba's cache, by playing one episode."""
+    player = make_player(env)
+    player.load(random_weights(player.spec, hidden=64, seed=0))
+    seed = seeds.episode_seed(0, seeds.EVALUATION, 0)
+    player.play(Ticket(0, 0, seed, Exploration.SOFTMAX_FLOOR, epsilon=0.5))

@@ -1,0 +1,301 @@
+"""The policy FC - ReLU - GRU - FC and its exploration as compiled float32 code.
+
+Only `contract` of fast-math is on: a product and a sum may fuse, nothing may change order, so equal
+inputs give equal bytes on equal machines.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from liir_common import rng
+from liir_common.types import EnvSpec, Exploration, FloatArray, Weights, policy_shapes
+
+SOFTMAX_FLOOR, EPSILON_GREEDY, GREEDY = 0, 1, 2
+MODES = {
+    Exploration.SOFTMAX_FLOOR: SOFTMAX_FLOOR,
+    Exploration.EPSILON_GREEDY: EPSILON_GREEDY,
+    Exploration.GREEDY: GREEDY,
+}
+"""What `act` calls each exploration."""
+
+
+class Choice(NamedTuple):
+    """How `act` chooses, for one episode."""
+
+    stream: rng.Stream
+    """Every agent takes one draw a step, needed or not: its position depends on the step alone."""
+    mode: int
+    """A value of MODES."""
+    epsilon: float
+    """In [0, 1]"""
+
+
+class Policy(NamedTuple):
+    """Weights laid out for `act`, and the room it works in: a policy serves one thread at a time.
+
+    Weights are [inputs, outputs], so that the innermost loop runs along memory; H hidden units.
+    """
+
+    fc1_obs: FloatArray
+    """[O, H]"""
+    fc1_action: FloatArray
+    """[A, H], what a one-hot last action adds"""
+    fc1_agent: FloatArray
+    """[n, H], what the one-hot agent id adds, with the bias"""
+    gru_input: FloatArray
+    """[H, 3H], gates r, z, n"""
+    gru_input_bias: FloatArray
+    """[3H]"""
+    gru_hidden: FloatArray
+    """[H, 3H], gates r, z, n"""
+    gru_hidden_bias: FloatArray
+    """[3H]"""
+    fc2: FloatArray
+    """[H, A]"""
+    fc2_bias: FloatArray
+    """[A]"""
+    features: FloatArray
+    """[n, H], room for the output of the first layer"""
+    input_gates: FloatArray
+    """[n, 3H], room"""
+    hidden_gates: FloatArray
+    """[n, 3H], room"""
+    logits: FloatArray
+    """[n, A], room; after `act` the network's outputs, not masked"""
+
+
+def pack(weights: Weights, spec: EnvSpec, hidden: int = 64) -> Policy:
+    """Lay out the weights of a policy with `hidden` units for `act`.
+
+    Raises:
+        ValueError: a parameter is missing, unknown, of another shape or dtype, or not finite.
+    """
+    _check(weights, policy_shapes(spec, hidden))
+    n, actions, width = spec.n_agents, spec.n_actions, spec.obs_dim
+    fc1 = weights["fc1.weight"].T
+    return Policy(
+        fc1_obs=_aligned(fc1[:width]),
+        fc1_action=_aligned(fc1[width : width + actions]),
+        fc1_agent=_aligned(fc1[width + actions :] + weights["fc1.bias"]),
+        gru_input=_aligned(weights["gru.weight_ih"].T),
+        gru_input_bias=_aligned(weights["gru.bias_ih"]),
+        gru_hidden=_aligned(weights["gru.weight_hh"].T),
+        gru_hidden_bias=_aligned(weights["gru.bias_hh"]),
+        fc2=_aligned(weights["fc2.weight"].T),
+        fc2_bias=_aligned(weights["fc2.bias"]),
+        features=_aligned(np.zeros((n, hidden))),
+        input_gates=_aligned(np.zeros((n, 3 * hidden))),
+        hidden_gates=_aligned(np.zeros((n, 3 * hidden))),
+        logits=_aligned(np.zeros((n, actions))),
+    )
+
+
+def random_weights(spec: EnvSpec, hidden: int, seed: int) -> Weights:
+    """Weights for measurements, uniform in ± 1 / sqrt(H), the range that torch's GRU starts in."""
+    random = np.random.default_rng(seed)
+    bound = hidden**-0.5
+    shapes = policy_shapes(spec, hidden)
+    return {name: random.uniform(-bound, bound, shape).astype(np.float32) for name, shape in shapes.items()}
+
+
+def _aligned(values: NDArray[np.floating]) -> FloatArray:
+    """A float32 copy at the start of a cache line; loads that span two lines cost a quarter of the speed."""
+    line = 64
+    memory = np.empty(values.size * 4 + line, np.uint8)
+    start = -memory.ctypes.data % line
+    copy = memory[start : start + values.size * 4].view(np.float32).reshape(values.shape)
+    copy[...] = values
+    return copy
+
+
+def _check(weights: Weights, shapes: dict[str, tuple[int, ...]]) -> None:
+    if weights.keys() != shapes.keys():
+        missing, unknown = sorted(shapes.keys() - weights.keys()), sorted(weights.keys() - shapes.keys())
+        raise ValueError(f"a policy wants {', '.join(shapes)}; missing {missing}, unknown {unknown}")
+    for name, shape in shapes.items():
+        array = weights[name]
+        if array.shape != shape or array.dtype != np.float32:
+            raise ValueError(
+                f"policy parameter {name}: wanted float32 {shape}, got {array.dtype} {array.shape}; "
+                "do the environment and the hidden units match those of training?"
+            )
+        if not np.isfinite(array).all():
+            raise ValueError(
+                f"policy parameter {name}: {np.count_nonzero(~np.isfinite(array))} of {array.size} values "
+                "are not finite; the training that made it diverged"
+            )
+
+
+# Numerators and denominators of tanh as a 13/6 rational function, as Eigen has it; beyond the bound
+# float32 tanh is 1.
+_BOUND = np.float32(7.90531110763549805)
+_A1, _A3, _A5, _A7 = map(
+    np.float32, (4.89352455891786e-03, 6.37261928875436e-04, 1.48572235717979e-05, 5.12229709037114e-08)
+)
+_A9, _A11, _A13 = map(np.float32, (-8.60467152213735e-11, 2.00018790482477e-13, -2.76076847742355e-16))
+_B0, _B2, _B4, _B6 = map(
+    np.float32, (4.89352518554385e-03, 2.26843463243900e-03, 1.18534705686654e-04, 1.19825839466702e-06)
+)
+_HALF, _ZERO = np.float32(0.5), np.float32(0)
+
+
+@njit(inline="always")
+def _tanh(x):
+    x = min(max(x, -_BOUND), _BOUND)
+    s = x * x
+    numerator = x * (_A1 + s * (_A3 + s * (_A5 + s * (_A7 + s * (_A9 + s * (_A11 + s * _A13))))))
+    return numerator / (_B0 + s * (_B2 + s * (_B4 + s * _B6)))
+
+
+@njit(inline="always")
+def _sigmoid(x):
+    return _HALF + _HALF * _tanh(_HALF * x)
+
+
+@njit(cache=True, fastmath={"contract"})
+def _add_product(x, weight, out):
+    """out[n, columns] += x[n, rows] @ weight[rows, columns].
+
+    Four rows of the weight serve all agents while they are in the first-level cache, and each pass
+    over `out` does four fused multiply-adds per load and store.
+    """
+    n, rows = x.shape
+    columns = weight.shape[1]
+    by_four = rows - rows % 4
+    for i in range(0, by_four, 4):
+        for a in range(n):
+            x0, x1, x2, x3 = x[a, i], x[a, i + 1], x[a, i + 2], x[a, i + 3]
+            for j in range(columns):
+                # From left to right, so that each product has one sum to fuse with.
+                even = out[a, j] + x0 * weight[i, j] + x1 * weight[i + 1, j]
+                out[a, j] = even + x2 * weight[i + 2, j] + x3 * weight[i + 3, j]
+    for i in range(by_four, rows):
+        for a in range(n):
+            for j in range(columns):
+                out[a, j] += x[a, i] * weight[i, j]
+
+
+@njit(cache=True)
+def _affine(x, weight, bias, out):
+    """out[n, columns] = x[n, rows] @ weight[rows, columns] + bias[columns]."""
+    for a in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            out[a, j] = bias[j]
+    _add_product(x, weight, out)
+
+
+@njit(cache=True, fastmath={"contract"})
+def _embed(policy, obs, last_actions):
+    """ReLU of the first layer into `features`; one-hot inputs are additions of a row."""
+    features = policy.features
+    n, units = features.shape
+    for a in range(n):
+        for j in range(units):
+            features[a, j] = policy.fc1_agent[a, j]
+        if last_actions[a] >= 0:
+            for j in range(units):
+                features[a, j] += policy.fc1_action[last_actions[a], j]
+    _add_product(obs, policy.fc1_obs, features)
+    for a in range(n):
+        for j in range(units):
+            features[a, j] = max(features[a, j], _ZERO)
+
+
+# Python's check for division by zero would keep the loop over units from vectorising.
+@njit(cache=True, fastmath={"contract"}, error_model="numpy")
+def _recur(policy, hidden):
+    """One step of torch's GRUCell on `features`: hidden[n, H] in place."""
+    units = hidden.shape[1]
+    _affine(policy.features, policy.gru_input, policy.gru_input_bias, policy.input_gates)
+    _affine(hidden, policy.gru_hidden, policy.gru_hidden_bias, policy.hidden_gates)
+    for a in range(len(hidden)):
+        x, h = policy.input_gates[a], policy.hidden_gates[a]
+        for j in range(units):
+            reset = _sigmoid(x[j] + h[j])
+            update = _sigmoid(x[units + j] + h[units + j])
+            new = _tanh(x[2 * units + j] + reset * h[2 * units + j])
+            hidden[a, j] = new + update * (hidden[a, j] - new)
+
+
+@njit(cache=True)
+def _best(logits, mask):
+    """The available action with the largest output; the lowest index among equals."""
+    best = -1
+    for action in range(len(logits)):
+        if mask[action] and (best < 0 or logits[action] > logits[best]):
+            best = action
+    return best
+
+
+@njit(cache=True)
+def _probability(action, logits, best, total, available, choice):
+    if choice.mode == SOFTMAX_FLOOR:
+        p = math.exp(np.float64(logits[action]) - logits[best]) / total
+    else:
+        p = 1.0 if action == best else 0.0
+    return p if choice.mode == GREEDY else (1.0 - choice.epsilon) * p + choice.epsilon / available
+
+
+@njit(cache=True)
+def _sample(logits, mask, draw, choice):
+    """The action at the uniform number `draw` of the masked distribution, and its probability."""
+    best = _best(logits, mask)
+    available, total = 0, 0.0
+    for action in range(len(logits)):
+        if mask[action]:
+            available += 1
+            total += math.exp(np.float64(logits[action]) - logits[best])
+    taken, probability, reached = best, 1.0, 0.0
+    for action in range(len(logits)):
+        if mask[action]:
+            p = _probability(action, logits, best, total, available, choice)
+            reached += p
+            if p > 0.0:
+                # Stays the last possible action where rounding leaves the sum below the draw.
+                taken, probability = action, p
+            if draw < reached:
+                break
+    return taken, probability
+
+
+@njit(cache=True, nogil=True)
+def act(policy, hidden, obs, last_actions, mask, choice, actions, log_mu):
+    """One decision of the team.
+
+    Args:
+        policy: from `pack`.
+        hidden: [n, H] float32, the recurrent state; zeros before the first step; updated in place.
+        obs: [n, O] float32.
+        last_actions: [n] integers, -1 before the first step; may be the array `actions`.
+        mask: [n, A] bool, true where available; `first_stuck` finds rows without any.
+        choice: how to choose; its stream advances by n draws.
+        actions: [n] integers, written.
+        log_mu: [n] float32, written: log of the probability of the action taken; 0 if greedy.
+    """
+    _embed(policy, obs, last_actions)
+    _recur(policy, hidden)
+    _affine(hidden, policy.fc2, policy.fc2_bias, policy.logits)
+    for a in range(len(hidden)):
+        actions[a], probability = _sample(policy.logits[a], mask[a], rng.uniform(choice.stream), choice)
+        log_mu[a] = math.log(probability)
+
+
+@njit(cache=True, nogil=True)
+def first_stuck(mask):
+    """Lowest agent of mask[n, A] without an available action, or -1."""
+    for a in range(mask.shape[0]):
+        if not mask[a].any():
+            return a
+    return -1
+
+
+def stuck_message(agent: int, step: int) -> str:
+    """What to tell whoever wrote an environment that left `agent` without an action at `step`."""
+    return (
+        f"step {step}: agent {agent} has no available action (its action mask is all zero); "
+        "the environment must leave at least one, for example a no-op for a dead agent"
+    )

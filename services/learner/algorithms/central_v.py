@@ -1,0 +1,44 @@
+"""Central-V: the policy gradient of every agent with the team's advantage (Foerster et al., AAAI 2018)."""
+
+from __future__ import annotations
+
+import torch
+
+from liir_common.config import AlgorithmConfig
+from liir_common.types import Batch, EnvSpec
+from services.learner.algorithms.actor_critic import ActorCritic
+from services.learner.algorithms.metrics import to_floats
+from services.learner.algorithms.networks import StateValue, coma_critic_size, count, fit_width
+
+
+class CentralV(ActorCritic):
+    """Policy θ and value ϕ; ϕ alone has the size that η, φ and ϕ of LIIR have together."""
+
+    def __init__(
+        self, spec: EnvSpec, config: AlgorithmConfig, seed: int, device: torch.device, dtype: torch.dtype
+    ) -> None:
+        width = fit_width(coma_critic_size(spec), lambda width: count(StateValue(spec, width).shapes))
+        super().__init__(spec, config, seed, device, dtype, width)
+
+    def update(self, batch: Batch) -> dict[str, float]:
+        """One learner step on `batch`; returns its figures.
+
+        Raises:
+            ValueError: the batch does not fit (see `prepare`); nothing has changed then.
+            FloatingPointError: learning has diverged.
+        """
+        data = self._prepare(batch)
+        value, target = self._varphi.values(data)
+        returns = self._return(data, data.reward, target)
+        _, _, metrics = self._policy.advance(data, self._advantage(data, returns, value))
+        return to_floats(metrics | self._varphi.fit(data, returns, "value"))
+
+    def parameter_counts(self) -> dict[str, int]:
+        """Parameters of each network and the budget of all but θ."""
+        return {
+            "theta": self._policy.theta.numel(),
+            "eta": 0,
+            "phi": 0,
+            "varphi": self._varphi.size,
+            "budget": coma_critic_size(self._spec),
+        }

@@ -1,0 +1,168 @@
+"""The networks as pure functions of one flat parameter vector and their input.
+
+Flat vectors make an optimiser a handful of vector operations, and a direction in parameter space, which
+the meta-gradient needs, an ordinary tensor.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Mapping
+from typing import Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional
+
+from liir_common.types import EnvSpec, policy_shapes
+from services.learner.algorithms.gru import gru
+
+Shapes = Mapping[str, tuple[int, ...]]
+
+
+def count(shapes: Shapes) -> int:
+    """Number of parameters."""
+    return sum(math.prod(shape) for shape in shapes.values())
+
+
+def views(flat: Tensor, shapes: Shapes) -> dict[str, Tensor]:
+    """The parameters inside `flat` [count(shapes)], by name."""
+    parts = flat.split_with_sizes([math.prod(shape) for shape in shapes.values()])
+    return {name: part.view(shape) for part, (name, shape) in zip(parts, shapes.items(), strict=True)}
+
+
+def arrays(flat: Tensor, shapes: Shapes) -> dict[str, NDArray[np.float32]]:
+    """float32 copies of the parameters inside `flat`, by name."""
+    return {name: view.float().cpu().numpy().copy() for name, view in views(flat, shapes).items()}
+
+
+class Network(Protocol):
+    """What all networks have; each is called with its flat parameters and its inputs."""
+
+    head: str
+    """Name of the last layer"""
+
+    @property
+    def shapes(self) -> Shapes:
+        """Names and shapes of the parameters, in the order of the flat vector."""
+
+
+def initial(
+    network: Network, head_gain: float, orthogonal: bool, seed: int, device: torch.device, dtype: torch.dtype
+) -> Tensor:
+    """Fresh flat parameters; the weights of the last layer are scaled by `head_gain`.
+
+    Orthogonal (Saxe et al., 2014): gain √2 before a ReLU, biases zero. Otherwise uniform within
+    ± 1 / √(inputs of the unit), a head's bias scaled like its weights.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    flat = torch.zeros(count(network.shapes), dtype=dtype)
+    for name, parameter in views(flat, network.shapes).items():
+        layer = name.split(".")[0]
+        if orthogonal and "weight" in name:
+            gain = {network.head: head_gain, "gru": 1.0}.get(layer, math.sqrt(2))
+            torch.nn.init.orthogonal_(parameter, gain, generator=generator)
+        elif not orthogonal:
+            bound = 1 / math.sqrt(network.shapes[name.replace("bias", "weight")][1])
+            bound *= head_gain if layer == network.head else 1.0
+            parameter.uniform_(-bound, bound, generator=generator)
+    return flat.to(device)
+
+
+class PolicyNetwork:
+    """FC - ReLU - GRU - FC over the packed rows of `Data`."""
+
+    head = "fc2"
+
+    def __init__(self, spec: EnvSpec, hidden: int) -> None:
+        self.shapes = policy_shapes(spec, hidden)
+
+    def __call__(self, flat: Tensor, inputs: Tensor, sizes: list[int]) -> Tensor:
+        """Logits [R, A] for inputs (observation, last action, agent id) [R, O + A + n]."""
+        p = views(flat, self.shapes)
+        x = functional.linear(inputs, p["fc1.weight"], p["fc1.bias"]).relu()
+        gates = functional.linear(x, p["gru.weight_ih"], p["gru.bias_ih"])
+        h = gru(gates, p["gru.weight_hh"], p["gru.bias_hh"], sizes)
+        return functional.linear(h, p["fc2.weight"], p["fc2.bias"])
+
+
+class Mlp:
+    """FC - ReLU - FC - ReLU - FC."""
+
+    head = "fc3"
+
+    def __init__(self, inputs: int, hidden: int, outputs: int) -> None:
+        sizes = [inputs, hidden, hidden, outputs]
+        self.shapes: dict[str, tuple[int, ...]] = {}
+        for layer, (n_in, n_out) in enumerate(itertools.pairwise(sizes), 1):
+            self.shapes |= {f"fc{layer}.weight": (n_out, n_in), f"fc{layer}.bias": (n_out,)}
+
+    def __call__(self, flat: Tensor, x: Tensor) -> Tensor:
+        """Outputs [..., outputs] for inputs [..., inputs]."""
+        p = views(flat, self.shapes)
+        return _above(p, functional.linear(x, p["fc1.weight"], p["fc1.bias"]))
+
+
+class StateValue(Mlp):
+    """V_ϕ(s), which sees nothing but the state."""
+
+    def __init__(self, spec: EnvSpec, hidden: int) -> None:
+        super().__init__(spec.state_dim, hidden, 1)
+
+    def __call__(self, flat: Tensor, x: Tensor) -> Tensor:
+        """Values [M, 1] of states [M, S]."""
+        return super().__call__(flat, x)
+
+
+class AgentValue(Mlp):
+    """V_φ(s, i): one value per agent, dead or alive, from the state and the agent's id."""
+
+    def __init__(self, spec: EnvSpec, hidden: int) -> None:
+        super().__init__(spec.state_dim + spec.n_agents, hidden, 1)
+
+    def __call__(self, flat: Tensor, x: Tensor) -> Tensor:
+        """Values [M, n] of states [M, S]."""
+        p = views(flat, self.shapes)
+        of_state, of_id = p["fc1.weight"].split_with_sizes(
+            [x.shape[1], p["fc1.weight"].shape[1] - x.shape[1]], 1
+        )
+        # The state's part of the first layer is the same for all agents of a step.
+        first = functional.linear(x, of_state, p["fc1.bias"]).unsqueeze(1) + of_id.t()
+        return _above(p, first).squeeze(-1)
+
+
+class IntrinsicReward(Mlp):
+    """r_in(η; s_i, u_i) for every action, squashed to ± bound."""
+
+    def __init__(self, spec: EnvSpec, hidden: int, bound: float) -> None:
+        super().__init__(spec.obs_dim + spec.n_agents, hidden, spec.n_actions)
+        self._bound = bound
+
+    def __call__(self, flat: Tensor, x: Tensor) -> Tensor:
+        """[R, A] for inputs (observation, agent id) [R, O + n]."""
+        return self._bound * torch.tanh(super().__call__(flat, x) / self._bound)
+
+
+def _above(p: Mapping[str, Tensor], first: Tensor) -> Tensor:
+    hidden = functional.linear(first.relu(), p["fc2.weight"], p["fc2.bias"]).relu()
+    return functional.linear(hidden, p["fc3.weight"], p["fc3.bias"])
+
+
+def coma_critic_size(spec: EnvSpec) -> int:
+    """Parameters of COMA's critic, 128 - 128, the budget of everything beside the policy (section 5.2.1).
+
+    It sees the state, the observation, all agents' actions and last actions, and the agent's id.
+    """
+    inputs = spec.state_dim + spec.obs_dim + spec.n_agents * (2 * spec.n_actions + 1)
+    return count(Mlp(inputs, 128, spec.n_actions).shapes)
+
+
+def fit_width(budget: int, size: Callable[[int], int]) -> int:
+    """The width of hidden layers whose `size` in parameters comes closest to `budget`."""
+    width = 1
+    while size(width + 1) <= budget:
+        width += 1
+    return min(width, width + 1, key=lambda w: abs(size(w) - budget))

@@ -1,0 +1,318 @@
+"""A real learner process, spoken to over its real port by a test that plays the actor's part."""
+
+from __future__ import annotations
+
+import queue
+import socket
+import subprocess
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from hashlib import sha256
+from pathlib import Path
+
+import grpc
+import numpy as np
+import pytest
+from grpc_health.v1 import health_pb2, health_pb2_grpc
+from grpc_reflection.v1alpha.proto_reflection_descriptor_database import ProtoReflectionDescriptorDatabase
+
+from liir_common import checkpoint, seeds
+from liir_common.build import build
+from liir_common.client import CheckpointClient, TrainingClient
+from liir_common.errors import LiirError, UnreachableError
+from liir_common.rollout.play import make_player
+from liir_common.rpc import codec
+from liir_common.rpc.channel import CHANNEL_OPTIONS, connect
+from liir_common.rpc.gen.liir.v1 import checkpoint_pb2, rollout_pb2, rollout_pb2_grpc, training_pb2
+from liir_common.types import Ticket, policy_shapes
+from tests.e2e import service
+
+NO_STATS = rollout_pb2.ActorStats()
+PLAYER = service.config("env.map=3m")
+
+
+class Actor:
+    """Speaks one stream, a message at a time."""
+
+    def __init__(self, address: str, **hello: object) -> None:
+        self.player = make_player(PLAYER.env)
+        self._channel = grpc.insecure_channel(address, options=CHANNEL_OPTIONS)
+        self._outgoing: queue.SimpleQueue[rollout_pb2.PlayRequest | None] = queue.SimpleQueue()
+        fields = {"actor_id": "test", "env_spec_hash": self.player.spec.hash, "build": build()} | hello
+        self._outgoing.put(rollout_pb2.PlayRequest(hello=rollout_pb2.Hello(**fields)))
+        stub = rollout_pb2_grpc.RolloutServiceStub(self._channel)
+        self._responses = stub.Play(iter(self._outgoing.get, None), timeout=60)
+
+    def __enter__(self) -> Actor:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._outgoing.put(None)
+        self._channel.close()
+
+    def ask(self, tickets: int = 1) -> None:
+        self._outgoing.put(rollout_pb2.PlayRequest(ready=rollout_pb2.Ready(tickets=tickets)))
+
+    def send(self, message: rollout_pb2.Trajectory) -> None:
+        self._outgoing.put(rollout_pb2.PlayRequest(trajectory=message))
+
+    def receive(self, body: str) -> rollout_pb2.PlayResponse:
+        response = next(self._responses)
+        assert response.WhichOneof("body") == body, response
+        return response
+
+    def order(self) -> Ticket:
+        """The next ticket, with the policy loaded that it names."""
+        response = next(self._responses)
+        if response.WhichOneof("body") == "policy":
+            self.player.load(codec.decode_policy(response.policy, policy_shapes(self.player.spec, 64)))
+            response = next(self._responses)
+        return codec.decode_ticket(response.ticket)
+
+    def play(self, ticket: Ticket) -> rollout_pb2.Trajectory:
+        return codec.encode_trajectory(self.player.play(ticket), NO_STATS)
+
+    def error(self) -> grpc.RpcError:
+        with pytest.raises(grpc.RpcError) as caught:
+            for _ in self._responses:
+                pass
+        return caught.value
+
+
+@pytest.fixture
+def learner(tmp_path: Path) -> Iterator[tuple[str, Path]]:
+    """Address and run directory of a learner whose batches have four episodes."""
+    run_dir = tmp_path / "run"
+    settings = ("training.batch_episodes=4", "training.checkpoint_interval=6", "training.total_env_steps=2000")
+    process = service.start("learner", "--run-dir", str(run_dir), *service.arguments(settings))
+    try:
+        service.wait_for((run_dir / "endpoints.json").exists, "the learner's start")
+        yield service.endpoints(run_dir)["address"], run_dir
+    finally:
+        process.terminate()
+        service.finish(process)
+
+
+def play_batches(address: str, batches: int) -> None:
+    with Actor(address) as actor:
+        for _ in range(4 * batches):
+            actor.ask()
+            actor.send(actor.play(actor.order()))
+            actor.receive("ack")
+
+
+def test_play_stream(learner: tuple[str, Path]) -> None:
+    """Hello, policy once per version, tickets in order, acks; a second copy is acked and changes nothing."""
+    address, _ = learner
+    with Actor(address) as actor, TrainingClient(address) as training:
+        actor.ask(3)
+        first = actor.receive("policy").policy
+        assert first.version == 0
+        tickets = [codec.decode_ticket(actor.receive("ticket").ticket) for _ in range(3)]
+        assert [ticket.episode_id for ticket in tickets] == [0, 1, 2]
+        assert tickets[2].seed == seeds.episode_seed(PLAYER.seed, seeds.TRAINING, 2)
+        assert training.status().tickets_outstanding == 3
+        actor.player.load(codec.decode_policy(first, policy_shapes(actor.player.spec, 64)))
+        for _ in range(2):
+            actor.send(actor.play(tickets[0]))
+            assert actor.receive("ack").ack.episode_id == 0
+        actor.ask()
+        for ticket in [*tickets[1:], codec.decode_ticket(actor.receive("ticket").ticket)]:
+            actor.send(actor.play(ticket))
+            actor.receive("ack")
+        actor.ask()
+        assert actor.order().policy_version == 1
+        assert training.status().learner_step == 1
+        assert training.status().episodes == 4
+
+
+def test_tickets_of_a_broken_stream_go_to_the_next_actor(learner: tuple[str, Path]) -> None:
+    address, _ = learner
+    with Actor(address) as actor:
+        actor.ask(2)
+        assert actor.order().episode_id == 0
+    with Actor(address) as actor:
+        actor.ask(1)
+        assert actor.order().episode_id == 0
+
+
+def nan_reward(message: rollout_pb2.Trajectory) -> None:
+    message.reward.data = np.full(message.reward.shape[0], np.nan, np.float32).tobytes()
+
+
+def never_ordered(message: rollout_pb2.Trajectory) -> None:
+    message.episode_id = 999
+
+
+def wrong_shape(message: rollout_pb2.Trajectory) -> None:
+    message.obs.shape[1] += 1
+
+
+def no_action(message: rollout_pb2.Trajectory) -> None:
+    message.mask.data = bytes(len(message.mask.data))
+
+
+@pytest.mark.parametrize(
+    ("damage", "reason"),
+    [
+        (nan_reward, "reward: wanted finite"),
+        (never_ordered, "episode 999 was never ordered"),
+        (wrong_shape, "obs: wanted float32"),
+        (no_action, "no available action"),
+    ],
+)
+def test_a_bad_trajectory_ends_its_stream_and_nothing_else(
+    learner: tuple[str, Path], damage: Callable[[rollout_pb2.Trajectory], None], reason: str
+) -> None:
+    address, _ = learner
+    with Actor(address) as actor:
+        actor.ask()
+        message = actor.play(actor.order())
+        damage(message)
+        actor.send(message)
+        error = actor.error()
+    assert error.code() == grpc.StatusCode.INVALID_ARGUMENT
+    assert reason in error.details()
+    play_batches(address, 1)
+    with TrainingClient(address) as training:
+        service.wait_for(lambda: training.status().learner_step == 1, "the learner step")
+
+
+@pytest.mark.parametrize(
+    ("hello", "code"),
+    [
+        ({"env_spec_hash": "other"}, grpc.StatusCode.FAILED_PRECONDITION),
+        ({"build": "other"}, grpc.StatusCode.FAILED_PRECONDITION),
+    ],
+)
+def test_actors_that_would_play_other_episodes_are_refused(
+    learner: tuple[str, Path], hello: dict[str, str], code: grpc.StatusCode
+) -> None:
+    with Actor(learner[0], **hello) as actor:
+        error = actor.error()
+    assert error.code() == code
+    assert "wanted" in error.details()
+    assert "got" in error.details()
+
+
+def test_streams_that_break_the_protocol_are_refused(learner: tuple[str, Path]) -> None:
+    with connect(learner[0]) as connection:
+        stub = rollout_pb2_grpc.RolloutServiceStub(connection)
+        ready = rollout_pb2.PlayRequest(ready=rollout_pb2.Ready(tickets=1))
+        with pytest.raises(grpc.RpcError, match="must be hello"):
+            next(stub.Play(iter([ready]), timeout=10))
+    with Actor(learner[0]) as actor:
+        actor.ask(0)
+        assert actor.error().code() == grpc.StatusCode.INVALID_ARGUMENT
+
+
+def test_checkpoints_are_listed_watched_and_fetched(learner: tuple[str, Path], tmp_path: Path) -> None:
+    address, run_dir = learner
+    play_batches(address, 3)
+    with CheckpointClient(address) as client:
+        watched = client.watch()
+        first, second = next(watched), next(watched)
+        assert [first.episode, second.episode] == [6, 12]
+        assert list(client.list(after_episode=6)) == [second]
+        manifest, tensors = client.get(6)
+        stored = run_dir / "checkpoints" / "checkpoint-000000006.safetensors"
+        assert manifest.sha256 == first.sha256 == sha256(stored.read_bytes()).hexdigest()
+        assert manifest.policy_version == 2
+        assert manifest.config["training"]["batch_episodes"] == 4
+        shapes = {name: array.shape for name, array in checkpoint.section(tensors, "policy").items()}
+        assert shapes == policy_shapes(make_player(PLAYER.env).spec, 64)
+        stored.write_bytes(stored.read_bytes()[:-1])
+        with pytest.raises(LiirError, match="corrupt"):
+            client.get(6)
+        with pytest.raises(LiirError, match="no checkpoint of episode 7"):
+            client.get(7)
+
+
+def test_evaluations_are_stored_once(learner: tuple[str, Path]) -> None:
+    address, run_dir = learner
+    play_batches(address, 2)
+    with CheckpointClient(address) as client:
+        frozen = next(client.watch())
+        stats = checkpoint_pb2.EpisodeStats(episodes=4, wins=3, return_mean=1.5, info_means={"won": 0.75})
+        evaluation = checkpoint_pb2.Evaluation(
+            episode=6, sha256=frozen.sha256, env_steps=frozen.env_steps, greedy=stats, sampled=stats
+        )
+        assert client.report(evaluation)
+        assert not client.report(evaluation)
+        assert list(client.evaluations()) == [evaluation]
+        rows = (run_dir / "evaluations.csv").read_text().splitlines()
+        assert len(rows) == 2
+        wrong = checkpoint_pb2.Evaluation(episode=6, sha256="0", greedy=stats, sampled=stats)
+        with pytest.raises(grpc.RpcError) as caught:
+            client.report(wrong)
+        assert caught.value.code() == grpc.StatusCode.INVALID_ARGUMENT
+
+
+def test_health_and_reflection(learner: tuple[str, Path]) -> None:
+    with connect(learner[0]) as connection:
+        health = health_pb2_grpc.HealthStub(connection)
+        answer = health.Check(health_pb2.HealthCheckRequest(service="liir.v1.RolloutService"), timeout=10)
+        assert answer.status == health_pb2.HealthCheckResponse.SERVING
+        services = set(ProtoReflectionDescriptorDatabase(connection).get_services())
+    names = ("RolloutService", "CheckpointService", "TrainingService")
+    assert {f"liir.v1.{name}" for name in names} <= services
+    assert "grpc.health.v1.Health" in services
+
+
+def test_stop_saves_and_resume_goes_on(tmp_path: Path) -> None:
+    run_dir = tmp_path / "run"
+    options = ("--run-dir", str(run_dir), *service.arguments(["training.batch_episodes=4"]))
+    process = service.start("learner", *options)
+    service.wait_for((run_dir / "endpoints.json").exists, "the learner's start")
+    address = service.endpoints(run_dir)["address"]
+    play_batches(address, 2)
+    with TrainingClient(address) as training:
+        service.wait_for(lambda: training.status().learner_step == 2, "two learner steps")
+        training.stop("test")
+    service.finish(process)
+    (run_dir / "endpoints.json").unlink()
+    process = service.start("learner", "--resume", *options)
+    service.wait_for((run_dir / "endpoints.json").exists, "the learner's second start")
+    with Actor(service.endpoints(run_dir)["address"]) as actor:
+        actor.ask()
+        ticket = actor.order()
+    assert (ticket.episode_id, ticket.policy_version) == (8, 2)
+    process.terminate()
+    service.finish(process)
+
+
+def test_a_busy_port_is_an_error_that_says_what_to_do(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        for key, advice in (("learner.port", "learner.port=N"), ("learner.metrics_port", "learner.metrics_port=N")):
+            settings = service.arguments([f"{key}={port}"])
+            process = service.start("learner", "--run-dir", str(tmp_path / key), *settings)
+            assert advice in service.finish(process, code=2)
+
+
+def test_an_open_address_is_refused_unless_asked_for(tmp_path: Path) -> None:
+    process = service.start("learner", "--run-dir", str(tmp_path / "run"), *service.arguments(["learner.host=0.0.0.0"]))
+    assert "learner.insecure=true" in service.finish(process, code=2)
+
+
+def test_an_unreachable_learner_is_an_error_that_says_so() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        address = f"127.0.0.1:{silent.getsockname()[1]}"
+        with pytest.raises(UnreachableError, match="no learner answered"):
+            connect(address, timeout_s=0.5)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (["env.map=4m"], "4m"),
+        (["env.options.reward_only_positiv=true"], "reward_only_positiv"),
+        (["trainig.lag=1"], "did you mean 'training'"),
+    ],
+)
+def test_a_bad_configuration_ends_every_command_with_code_two(
+    tmp_path: Path, settings: list[str], message: str
+) -> None:
+    for command in ("learner", "train"):
+        process = service.start(command, "--run-dir", str(tmp_path / command), *service.arguments(settings))
+        assert message in service.finish(process, code=2)

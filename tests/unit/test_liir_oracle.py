@@ -1,0 +1,285 @@
+"""LIIR against a slow implementation in the paper's notation that differentiates through the inner step.
+
+The reference knows nothing of the learner's code: dense arrays, loops over time, `create_graph=True`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from liir_common.config import AlgorithmConfig
+from liir_common.types import Batch, EnvSpec, policy_shapes
+from services.learner.algorithms import Algorithm, make_algorithm
+from services.learner.bench import synthetic_batch
+
+SPEC = EnvSpec("test", "1", "{}", 3, 4, 3, 5, 9, ())
+CPU = torch.device("cpu")
+BETA_1, BETA_2 = 0.9, 0.999
+State = dict[str, Tensor]
+BASE = {"policy_hidden": 8, "lambda": 0.7, "policy_gain": 1.0, "r_in_gain": 1.0, "r_in_bound": 1.5}
+CASES: dict[str, dict[str, object]] = {
+    "strong": {},
+    "td0": {"gae_lambda": 0.0, "policy_epochs": 1, "normalize_advantages": False},
+    "gae": {"policy_epochs": 1, "normalize_advantages": False},
+    "normalised": {"policy_epochs": 1},
+    "clipped gradient": {"policy_optimizer": {"clip": 0.01, "lr": 0.02}},
+    "rmsprop": {"policy_optimizer": {"name": "rmsprop", "clip": 0.01}, "policy_epochs": 1},
+    "two steps": {"policy_epochs": 2, "entropy": 0.0, "ratio_clip": 0.05},
+    "targets": {"target_interval": 3, "gae_lambda": 0.8},
+    "bootstrap": {"limit_is_terminal": False, "normalize_values": False},
+    "default init": {"orthogonal_init": False},
+}
+
+
+def config_of(case: dict[str, object]) -> AlgorithmConfig:
+    return AlgorithmConfig.model_validate(BASE | case)
+
+
+def batch_of(seed: int, version: int = 0) -> Batch:
+    """Padding, deaths, truncation, and a behaviour policy that is not the learner's."""
+    batch = synthetic_batch(SPEC, episodes=6, steps=6, seed=seed, policy_version=version, epsilon=0.2)
+    noise = np.random.default_rng(seed).normal(0, 0.3, batch.log_mu.shape).astype(np.float32)
+    return replace(batch, log_mu=batch.log_mu + noise)
+
+
+@dataclass
+class Reference:
+    """What one update should have done, from the state before it."""
+
+    theta: Tensor
+    eta_gradient: Tensor
+    objective: Tensor
+    """J_ex, whose gradient at θ' is v"""
+    proxy_return: Tensor
+    extrinsic_return: Tensor
+    theta_before: Tensor
+
+
+def unflatten(flat: Tensor, shapes: dict[str, tuple[int, ...]]) -> dict[str, Tensor]:
+    out, start = {}, 0
+    for name, shape in shapes.items():
+        out[name] = flat[start : start + int(np.prod(shape))].reshape(shape)
+        start += out[name].numel()
+    assert start == flat.numel()
+    return out
+
+
+def mlp(flat: Tensor, x: Tensor, outputs: int) -> Tensor:
+    inputs = x.shape[-1]
+    # inputs·h + h + h² + h + outputs·h + outputs parameters
+    b = inputs + outputs + 2
+    h = round((-b + (b * b - 4 * (outputs - flat.numel())) ** 0.5) / 2)
+    shapes = {"w1": (h, inputs), "b1": (h,), "w2": (h, h), "b2": (h,), "w3": (outputs, h), "b3": (outputs,)}
+    p = unflatten(flat, shapes)
+    x = torch.relu(x @ p["w1"].T + p["b1"])
+    x = torch.relu(x @ p["w2"].T + p["b2"])
+    return x @ p["w3"].T + p["b3"]
+
+
+def t64(array: np.ndarray) -> Tensor:
+    return torch.as_tensor(array.astype(np.float64))
+
+
+def ids(*shape: int) -> Tensor:
+    return torch.eye(SPEC.n_agents, dtype=torch.float64).expand(*shape, SPEC.n_agents, SPEC.n_agents)
+
+
+def policy_probabilities(theta: Tensor, batch: Batch, hidden: int) -> Tensor:
+    """π [B, T, n, A]: GRU from h = 0 over every step, padding and dead agents included."""
+    p = unflatten(theta, policy_shapes(SPEC, hidden))
+    episodes, steps, n = batch.log_mu.shape
+    h = torch.zeros(episodes, n, hidden, dtype=theta.dtype)
+    last = torch.zeros(episodes, n, SPEC.n_actions, dtype=theta.dtype)
+    out = []
+    for t in range(steps):
+        x = torch.cat([t64(batch.obs[:, t]), last, ids(episodes)], -1)
+        x = torch.relu(x @ p["fc1.weight"].T + p["fc1.bias"])
+        i_r, i_z, i_n = (x @ p["gru.weight_ih"].T + p["gru.bias_ih"]).chunk(3, -1)
+        h_r, h_z, h_n = (h @ p["gru.weight_hh"].T + p["gru.bias_hh"]).chunk(3, -1)
+        r, z = torch.sigmoid(i_r + h_r), torch.sigmoid(i_z + h_z)
+        h = (1 - z) * torch.tanh(i_n + r * h_n) + z * h
+        mask = torch.as_tensor(batch.mask[:, t])
+        logits = (h @ p["fc2.weight"].T + p["fc2.bias"]).masked_fill(~mask, -1e30)
+        softmax = torch.softmax(logits, -1)
+        out.append((1 - batch.epsilon) * softmax + batch.epsilon * mask / mask.sum(-1, keepdim=True))
+        last = torch.eye(SPEC.n_actions, dtype=theta.dtype)[batch.actions[:, t]]
+    return torch.stack(out, 1)
+
+
+def log_pi_of(pi: Tensor, batch: Batch) -> Tensor:
+    """log π(u) [B, T, n], 0 where w is 0: the action there may not have been available."""
+    chosen = pi.gather(-1, torch.as_tensor(batch.actions)[..., None]).squeeze(-1)
+    return torch.where(weights_of(batch)[0] > 0, chosen, 1.0).log()
+
+
+def weights_of(batch: Batch) -> tuple[Tensor, Tensor]:
+    """w [B, T, n] and N."""
+    before = np.zeros_like(batch.terminated)
+    before[:, 1:] = batch.terminated[:, :-1]
+    w = t64((batch.filled & ~before)[..., None] & batch.alive[:, :-1])
+    return w, w.sum().clamp_min(1)
+
+
+def scaled(x: Tensor, state: State, name: str) -> Tensor:
+    total, first, second = state[f"{name}.moments"]
+    if total == 0:
+        return x
+    return first / total + (second / total - (first / total) ** 2).clamp_min(1e-6).sqrt() * x
+
+
+def td_lambda(reward: Tensor, value: Tensor, batch: Batch, config: AlgorithmConfig) -> Tensor:
+    """G_t = r_t + γ·(1 - term_t)·((1 - λ_g)·V_t+1 + λ_g·G_t+1), V_T in place of G_T at a cut."""
+    g = torch.zeros_like(reward)
+    for b, t in reversed(np.argwhere(batch.filled).tolist()):
+        terminal = batch.terminated[b, t] or (batch.truncated[b, t] and config.limit_is_terminal)
+        follows = t + 1 < batch.filled.shape[1] and batch.filled[b, t + 1]
+        ahead = value[b, t + 1]
+        if follows:
+            ahead = (1 - config.gae_lambda) * ahead + config.gae_lambda * g[b, t + 1]
+        g = g.clone()
+        g[b, t] = reward[b, t] + (0 if terminal else config.gamma * ahead)
+    return g
+
+
+def standardised(a: Tensor, w: Tensor, config: AlgorithmConfig) -> Tensor:
+    if not config.normalize_advantages:
+        return a
+    mean = (w * a).sum() / w.sum()
+    return (a - mean) / ((w * (a - mean) ** 2).sum() / w.sum() + 1e-10).sqrt()
+
+
+def proxy(eta: Tensor, state: State, batch: Batch, config: AlgorithmConfig) -> tuple[Tensor, Tensor]:
+    """Returns and advantages [B, T, n] of r_proxy."""
+    w, _ = weights_of(batch)
+    episodes, steps, _ = batch.log_mu.shape
+    local = torch.cat([t64(batch.obs[:, :-1]), ids(episodes, steps)], -1)
+    out = mlp(eta, local, SPEC.n_actions).gather(-1, torch.as_tensor(batch.actions)[..., None]).squeeze(-1)
+    r_in = config.r_in_bound * torch.tanh(out / config.r_in_bound)
+    r_proxy = t64(batch.reward)[..., None] + config.lambda_ * r_in * w
+    s = t64(batch.state)[:, :, None].expand(-1, -1, SPEC.n_agents, -1)
+    x = torch.cat([s, ids(episodes, steps + 1)], -1)
+    live, target = (scaled(mlp(state[k], x, 1).squeeze(-1), state, "phi") for k in critic_keys(state, "phi"))
+    g = td_lambda(r_proxy, target, batch, config)
+    return g, standardised(g - live[:, :-1], w, config)
+
+
+def critic_keys(state: State, name: str) -> tuple[str, str]:
+    target = f"{name}.target"
+    return f"{name}.parameters", target if target in state else f"{name}.parameters"
+
+
+def extrinsic(state: State, batch: Batch, config: AlgorithmConfig) -> tuple[Tensor, Tensor]:
+    s = t64(batch.state)
+    live, target = (scaled(mlp(state[k], s, 1), state, "varphi") for k in critic_keys(state, "varphi"))
+    g = td_lambda(t64(batch.reward)[..., None], target, batch, config)
+    a = (g - live[:, :-1]).expand(-1, -1, SPEC.n_agents)
+    return g, standardised(a, weights_of(batch)[0], config)
+
+
+class Preconditioner:
+    """The policy optimiser of the reference; returns the step with its diagonal frozen."""
+
+    def __init__(self, state: State, config: AlgorithmConfig) -> None:
+        self.config = config.policy_optimizer
+        self.square, self.mean = state["policy.optimizer.square"], state["policy.optimizer.mean"]
+        self.steps = int(state["policy.optimizer.steps"])
+
+    def __call__(self, g: Tensor) -> Tensor:
+        c = self.config
+        norm = (g**2).sum().sqrt()
+        g = g * c.clip / norm if norm > c.clip else g
+        self.steps += 1
+        frozen = g.detach()
+        if c.name == "rmsprop":
+            self.square = c.alpha * self.square + (1 - c.alpha) * frozen**2
+            return c.lr * g / (self.square.sqrt() + c.eps)
+        m = BETA_1 * self.mean + (1 - BETA_1) * g
+        self.mean = m.detach()
+        self.square = BETA_2 * self.square + (1 - BETA_2) * frozen**2
+        diagonal = 1 / ((self.square / (1 - BETA_2**self.steps)).sqrt() + c.eps)
+        return c.lr * m / (1 - BETA_1**self.steps) * diagonal
+
+
+def policy_gradient(theta: Tensor, a: Tensor, batch: Batch, config: AlgorithmConfig) -> Tensor:
+    """g(θ), differentiable in θ and A."""
+    w, n = weights_of(batch)
+    pi = policy_probabilities(theta, batch, config.policy_hidden)
+    log_pi = log_pi_of(pi, batch)
+    rho = (log_pi - t64(batch.log_mu)).exp()
+    if config.policy_epochs == 1:
+        surrogate = torch.where(rho < 1, rho, rho / rho.detach()) * a
+    else:
+        low, high = 1 - config.ratio_clip, 1 + config.ratio_clip
+        surrogate = torch.minimum(rho * a, rho.clamp(low, high) * a)
+    entropy = -(pi * torch.where(pi > 0, pi, 1.0).log()).sum(-1)
+    objective = (w * (surrogate + config.entropy * entropy)).sum() / n
+    return torch.autograd.grad(objective, theta, create_graph=True)[0]
+
+
+def outer_objective(theta: Tensor, batch: Batch, a_ex: Tensor, config: AlgorithmConfig) -> Tensor:
+    """J with ∇J = (1/N) Σ w · min(ρ, 1) · A_ex · ∇log π."""
+    w, n = weights_of(batch)
+    rho = (log_pi_of(policy_probabilities(theta, batch, config.policy_hidden), batch) - t64(batch.log_mu)).exp()
+    return (w * a_ex * torch.where(rho < 1, rho, 1 + rho.log())).sum() / n
+
+
+def inner_steps(eta: Tensor, state: State, batch: Batch, config: AlgorithmConfig) -> tuple[Tensor, Tensor]:
+    """θ before the last step, and θ'(η) with the graph of the last step."""
+    _, a = proxy(eta, state, batch, config)
+    precondition = Preconditioner(state, config)
+    theta = state["policy.parameters"]
+    for _ in range(config.policy_epochs):
+        before = theta.detach().requires_grad_()
+        theta = before + precondition(policy_gradient(before, a, batch, config))
+    return before.detach(), theta
+
+
+def reference(state: State, batch: Batch, config: AlgorithmConfig) -> Reference:
+    eta = state["eta.parameters"].clone().requires_grad_()
+    before, theta = inner_steps(eta, state, batch, config)
+    g_ex, a_ex = extrinsic(state, batch, config)
+    objective = outer_objective(theta, batch, a_ex.detach(), config)
+    (gradient,) = torch.autograd.grad(objective, eta)
+    g_proxy, _ = proxy(eta.detach(), state, batch, config)
+    return Reference(theta.detach(), gradient, objective, g_proxy, g_ex, before)
+
+
+def eta_gradient(before: State, after: State) -> Tensor:
+    """∇η J_ex, recovered from Adam's mean."""
+    return (after["eta.optimizer.mean"] - BETA_1 * before["eta.optimizer.mean"]) / (1 - BETA_1)
+
+
+def close(a: Tensor, b: Tensor, rtol: float) -> None:
+    error = float((a - b).norm() / b.norm())
+    assert float(b.norm()) > 1e-9
+    assert error < rtol, f"relative error {error:.2e}, wanted less than {rtol:.0e}"
+
+
+def warmed(config: AlgorithmConfig) -> tuple[Algorithm, State]:
+    """An algorithm in the middle of learning: moments, normalisers and targets are no longer zero."""
+    algorithm = make_algorithm(SPEC, config, 5, CPU, torch.float64)
+    for seed in range(4):
+        algorithm.update(batch_of(seed, seed))
+    return algorithm, algorithm.state()
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_update_equals_differentiating_through_the_inner_step(case: str) -> None:
+    config = config_of(CASES[case])
+    algorithm, before = warmed(config)
+    batch = batch_of(9, 9)
+    wanted = reference(before, batch, config)
+    algorithm.update(batch)
+    after = algorithm.state()
+    close(after["policy.parameters"], wanted.theta, 1e-12)
+    close(
+        after["policy.parameters"] - before["policy.parameters"],
+        wanted.theta - before["policy.parameters"],
+        1e-9,
+    )
+    close(eta_gradient(before, after), wanted.eta_gradient, 1e-9)

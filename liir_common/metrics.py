@@ -3,9 +3,12 @@
 Counters of actors reach the learner as deltas on their streams and are exposed there.
 """
 
+import structlog
 from prometheus_client import Counter, Gauge, Histogram, start_http_server
 
 from liir_common.errors import ConfigError
+
+log = structlog.get_logger()
 
 _FAST = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10)
 
@@ -63,4 +66,5 @@ def serve(port: int, setting: str) -> int:
             f"cannot serve metrics on port {port}: {error.strerror}; choose another with "
             f"--set {setting}=N (0 takes a free one)"
         ) from None
+    log.info("serving metrics", url=f"http://127.0.0.1:{server.server_port}/metrics")
     return int(server.server_port)

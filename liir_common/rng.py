@@ -9,7 +9,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from liir_common import seeds
+from liir_common import kernel_cache, seeds
+
+# Here, because every module with kernels imports this one first.
+kernel_cache.install()
 
 Stream = NDArray[np.uint64]
 """[1], the state of one stream; a fresh stream holds its seed"""

@@ -17,7 +17,9 @@ SPEC = EnvSpec(
 )
 
 
-def make_trajectory(episode_id: int = 0, version: int = 0, length: int = 6, spec: EnvSpec = SPEC) -> Trajectory:
+def make_trajectory(
+    episode_id: int = 0, version: int = 0, length: int = 6, spec: EnvSpec = SPEC
+) -> Trajectory:
     """An episode that could have been played: random, but the same for the same arguments."""
     random = np.random.default_rng([episode_id, version, length])
     shape = (length + 1, spec.n_agents)

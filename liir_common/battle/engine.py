@@ -35,7 +35,7 @@ _SHIELD_DELAY = SHIELD_DELAY * LOOPS_PER_SECOND
 _DELAY_LOW = FIRING_DELAY[0] * LOOPS_PER_SECOND
 _DELAY_SPAN = FIRING_DELAY[1] * LOOPS_PER_SECOND - _DELAY_LOW
 _NEVER = -1e9
-_LOW_32, _32 = np.uint64(0xFFFFFFFF), np.uint64(32)
+_HALF = np.uint64(1 << 63)
 
 
 @kernel
@@ -174,49 +174,51 @@ def _interrupt(rules, now, unit, spec):
 
 @inlined
 def _play_loop(tables, battle):
-    """Let every living unit act once, in an order drawn for this loop.
+    """Let every living unit act once, upwards or downwards by a coin toss.
 
-    The order is start, start + stride, start + 2 * stride, ... modulo the number of units with a stride
-    coprime to it; as strides come in opposite pairs, each of two units is first with probability 1/2.
+    So each of two units acts first with probability 1/2, and the processor can guess what comes next.
     """
     now, n = battle.clock[0], len(battle.units)
-    bits = rng.next_u64(battle.stream)
-    i = np.int64(((bits >> _32) * np.uint64(n)) >> _32)
-    stride = tables.strides[((bits & _LOW_32) * np.uint64(len(tables.strides))) >> _32]
-    first_look = i % tables.rules[0].n_allies
-    for _ in range(n):
+    upwards = rng.next_u64(battle.stream) < _HALF
+    walkers = 0
+    for k in range(n):
+        i = k if upwards else n - 1 - k
         if battle.units[i].alive:
-            _act(tables, battle, i, now, first_look)
-        i += stride
-        if i >= n:
-            i -= n
-    _fly_missiles(tables, battle, now)
-    _separate(tables, battle, now)
+            walkers += _act(tables, battle, i, now, upwards)
+    if tables.rules[0].has_missiles:
+        _fly_missiles(tables, battle, now)
+    if walkers:
+        _separate(tables, battle, now)
     battle.clock[0] = now + 1.0
 
 
 @inlined
-def _act(tables, battle, i, now, first_look):
+def _act(tables, battle, i, now, upwards):
+    """What one unit does in one loop; whether it walks."""
     unit, spec = battle.units[i], tables.specs[i]
     if unit.shield < spec.shield and now >= unit.hurt_at + _SHIELD_DELAY:
         unit.shield = min(spec.shield, unit.shield + _SHIELD_PER_LOOP)
     if unit.hits > 0:
         if now >= unit.hit_at:
             _release(tables, battle, i, now)
-        return
+        return False
+    # Most of the time in a fight: neither walking nor firing is possible yet.
+    if now < unit.free_at and now < unit.ready_at:
+        return False
     if unit.order == ATTACK_MOVE:
-        _acquire(tables, battle, i, now, first_look)
+        _acquire(tables, battle, i, now, upwards)
     if unit.target >= 0:
-        _attack(tables, battle, i, now)
-    elif unit.order >= MOVE:
-        _walk(tables, battle, i, unit.goal_x - battle.x[i], unit.goal_y - battle.y[i], now)
+        return _attack(tables, battle, i, now)
+    if unit.order == IDLE:
+        return False
+    return _walk(tables, battle, i, unit.goal_x - battle.x[i], unit.goal_y - battle.y[i], now)
 
 
 @inlined
-def _acquire(tables, battle, i, now, first_look):
+def _acquire(tables, battle, i, now, upwards):
     """Keep the target while it may be kept, else take the nearest within the scan range.
 
-    Equal distances are decided by where the look begins, which is random.
+    Equal distances are decided by where the look begins, and so by a coin toss.
     """
     units, unit, kind, rules = battle.units, battle.units[i], tables.specs[i].kind, tables.rules[0]
     if unit.target >= 0:
@@ -232,16 +234,13 @@ def _acquire(tables, battle, i, now, first_look):
     if not _count_near(battle, i, rules.n_allies, rules.widest_scan2):
         return
     nearest2 = np.inf
-    j = first_look
-    for _ in range(rules.n_allies):
+    for k in range(rules.n_allies):
+        j = k if upwards else rules.n_allies - 1 - k
         if units[j].alive:
             distance2 = _distance2(battle, i, j)
             if distance2 < nearest2 and distance2 <= tables.pairs[kind, tables.specs[j].kind].scan2:
                 nearest2 = distance2
                 unit.target = j
-        j += 1
-        if j == rules.n_allies:
-            j = 0
 
 
 @inlined
@@ -263,15 +262,18 @@ def _count_near(battle, i, last, radius2):
 
 @inlined
 def _attack(tables, battle, i, now):
-    """Attack the target if it is in reach and the weapon is ready, wait if it is not, else walk up."""
+    """Attack the target if it is in reach and the weapon is ready, wait if it is not, else walk up.
+
+    Whether it walks.
+    """
     unit, spec = battle.units[i], tables.specs[i]
     if not battle.units[unit.target].alive:
         unit.order, unit.target = IDLE, -1
-        return
+        return False
     x, y = battle.x[unit.target] - battle.x[i], battle.y[unit.target] - battle.y[i]
     if x * x + y * y > tables.pairs[spec.kind, tables.specs[unit.target].kind].reach2:
-        _walk(tables, battle, i, x, y, now)
-    elif now >= unit.ready_at:
+        return _walk(tables, battle, i, x, y, now)
+    if now >= unit.ready_at:
         delay = rng.uniform(battle.stream)
         if tables.rules[0].integer_delay:
             delay = np.floor(delay * (_DELAY_SPAN + 1.0)) / _DELAY_SPAN
@@ -281,6 +283,7 @@ def _attack(tables, battle, i, now):
         unit.aim = unit.target
         if now >= unit.hit_at:
             _release(tables, battle, i, now)
+    return False
 
 
 @inlined
@@ -377,14 +380,18 @@ def _redirect(tables, battle, i):
 
 @inlined
 def _walk(tables, battle, i, x, y, now):
-    """One loop of walking along (x, y), the way to the goal; a goal nearer than that is reached."""
+    """One loop of walking along (x, y), the way to the goal; a goal nearer than that is reached.
+
+    Whether it walks.
+    """
     unit, distance2 = battle.units[i], x * x + y * y
     if now < unit.free_at or distance2 == 0.0:
-        return
+        return False
     share = min(1.0, tables.specs[i].speed / np.sqrt(distance2))
     unit.heading_x, unit.heading_y = x * share, y * share
     unit.walked_at = now
     _displace(tables.pathing, battle, i, unit.heading_x, unit.heading_y)
+    return True
 
 
 @inlined
@@ -409,12 +416,11 @@ def _separate(tables, battle, now):
 @inlined
 def _separate_one(tables, battle, i, now):
     for j in range(len(battle.units)):
-        other = battle.units[j]
-        both_walked = other.walked_at == now
-        if j != i and other.alive and not (both_walked and j < i):
-            distance2 = _distance2(battle, i, j)
+        distance2 = _distance2(battle, i, j)
+        if distance2 < tables.rules[0].widest_contact2 and j != i and battle.units[j].alive:
+            both_walked = battle.units[j].walked_at == now
             contact = tables.pairs[tables.specs[i].kind, tables.specs[j].kind].contact
-            if distance2 < contact * contact:
+            if distance2 < contact * contact and not (both_walked and j < i):
                 _part(tables, battle, i, j, np.sqrt(distance2), contact, both_walked)
 
 

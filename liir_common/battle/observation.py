@@ -7,6 +7,8 @@ from liir_common.battle.tables import FIRST_ATTACK, SHOOT_RANGE, SIGHT, inlined,
 
 MAP_SIZE = 32.0
 _CENTRE = MAP_SIZE / 2.0
+# Products instead of quotients, which take several times as long; float32 shows no difference.
+_PER_SIGHT = 1.0 / SIGHT
 
 
 @kernel
@@ -91,17 +93,17 @@ def _write_seen(battle, i, j, obs, at):
     distance2 = x * x + y * y
     if distance2 >= SIGHT**2:
         return False
-    obs[at + 1] = np.sqrt(distance2) / SIGHT
-    obs[at + 2] = x / SIGHT
-    obs[at + 3] = y / SIGHT
+    obs[at + 1] = np.sqrt(distance2) * _PER_SIGHT
+    obs[at + 2] = x * _PER_SIGHT
+    obs[at + 3] = y * _PER_SIGHT
     return True
 
 
 @inlined
 def _write_health(unit, spec, shields, out, at):
-    out[at] = unit.health / spec.health
-    if shields and spec.shield > 0.0:
-        out[at + 1] = unit.shield / spec.shield
+    out[at] = unit.health * spec.per_health
+    if shields:
+        out[at + 1] = unit.shield * spec.per_shield
 
 
 @inlined
@@ -116,13 +118,13 @@ def _write_state(tables, battle, state):
         )
         width = 3 + is_ally + shields + bits
         if units[i].alive:
-            state[at] = units[i].health / specs[i].health
+            state[at] = units[i].health * specs[i].per_health
             if is_ally:
                 state[at + 1] = max(0.0, units[i].ready_at - battle.clock[0]) / specs[i].cooldown_norm
             state[at + 1 + is_ally] = (battle.x[i] - _CENTRE) / MAP_SIZE
             state[at + 2 + is_ally] = (battle.y[i] - _CENTRE) / MAP_SIZE
             if shields:
-                state[at + 3 + is_ally] = units[i].shield / specs[i].shield
+                state[at + 3 + is_ally] = units[i].shield * specs[i].per_shield
             if bits:
                 state[at + width - bits + specs[i].type_bit] = 1.0
         at += width

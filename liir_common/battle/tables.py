@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, fields
-from math import ceil, cos, gcd, hypot, pi, sin, sqrt
+from math import ceil, cos, hypot, pi, sin, sqrt
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -41,7 +41,7 @@ RULES = np.dtype(
         (name, np.int64)
         for name in (
             "n_allies", "n_enemies", "n_actions", "limit", "obs_dim", "state_dim",
-            "ally_bits", "enemy_bits", "ally_shields", "enemy_shields",
+            "ally_bits", "enemy_bits", "ally_shields", "enemy_shields", "has_missiles",
         )
     ]
     + [(name, np.float64) for name in ("reward_divisor", "widest_scan2", "widest_contact2")],
@@ -55,7 +55,8 @@ SPEC = np.dtype(
         (name, np.float64)
         for name in (
             "health", "shield", "armor", "radius", "speed", "period", "damage_point", "backswing",
-            "hit_interval", "missile_speed", "cooldown_norm", "spawn_x", "spawn_y", "goal_x", "goal_y",
+            "hit_interval", "missile_speed", "cooldown_norm", "per_health", "per_shield",
+            "spawn_x", "spawn_y", "goal_x", "goal_y",
         )
     ],
     align=True,
@@ -92,8 +93,6 @@ class Tables(NamedTuple):
     """[kinds, kinds] of PAIR"""
     pathing: NDArray[np.bool_]
     """[32, 32] by (x, y)"""
-    strides: NDArray[np.int64]
-    """The steps that visit all units, for random orders"""
 
 
 class Battle(NamedTuple):
@@ -185,7 +184,6 @@ def build_tables(scenario: Scenario, settings: Settings, pathing: NDArray[np.boo
         bits = scenario.ally_type_order if i < n_allies else scenario.enemy_type_order
         specs[i] = _spec(unit, kinds.index(unit), bits.index(unit.name) if bits else 0, spawn)
     _set_goals(specs[n_allies:], scenario.goal, settings.hold_formation)
-    strides = [s for s in range(1, len(units)) if gcd(s, len(units)) == 1]
     pairs = np.array([[_pair(a, b, settings) for b in kinds] for a in kinds], PAIR)
     rules = _rules(scenario, settings, units, n_allies)
     rules["widest_scan2"], rules["widest_contact2"] = pairs["scan2"].max(), pairs["contact"].max() ** 2
@@ -194,7 +192,6 @@ def build_tables(scenario: Scenario, settings: Settings, pathing: NDArray[np.boo
         specs=specs,
         pairs=pairs,
         pathing=pathing,
-        strides=np.array(strides, np.int64),
     )
 
 
@@ -207,6 +204,8 @@ def _spec(unit: UnitType, kind: int, type_bit: int, spawn: NDArray[np.float64]) 
         "health": unit.health,
         "shield": unit.shield,
         "armor": unit.armor,
+        "per_health": 1 / unit.health,
+        "per_shield": 1 / unit.shield if unit.shield else 0.0,
         "radius": unit.radius,
         "speed": unit.speed / loops,
         "period": weapon.period * loops,
@@ -257,6 +256,7 @@ def _rules(
     # SMAC v1 shows shields of the race that has them.
     rules["ally_shields"] = any(unit.shield for unit in units[:n_allies])
     rules["enemy_shields"] = any(unit.shield for unit in enemies)
+    rules["has_missiles"] = any(unit.weapon.missile_speed for unit in units)
     rules["obs_dim"], rules["state_dim"] = _sizes(rules[0])
     rules["reward_divisor"] = _reward_divisor(settings, enemies)
     return rules

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,42 +15,22 @@ from liir_common.rollout.player import Ending, Player
 from liir_common.rollout.policy import Choice, Policy, act, first_stuck, stuck_message
 
 
-def source_files() -> list[Path]:
-    """All code that an episode is compiled from, beside this file."""
-    package = Path(__file__).parents[1]
-    own = [package / name for name in ("rng.py", "seeds.py", "rollout/policy.py")]
-    return own + sorted((package / "battle").glob("*.py"))
-
-
-def _sources() -> str:
-    return hashlib.sha256(b"".join(file.read_bytes() for file in source_files())).hexdigest()
-
-
-def _compile(sources: str) -> Any:
-    # numba's cache notices changes of this file only; a variable of the closure is part of its key,
-    # so a change of the simulator is never answered with the episode compiled before it.
-    @njit(cache=True, nogil=True)
-    def play_episode(tables, battle, policy, hidden, rows, seed, choice):
-        """Fill `rows`; return the number of steps, and the agent without an action at the end or -1."""
-        sources  # noqa: B018
-        chosen = np.full(len(hidden), -1)
-        t = 0
-        reset(tables, battle, seed)
+@njit(cache=True, nogil=True)
+def _play_episode(tables, battle, policy, hidden, rows, seed, choice):
+    """Fill `rows`; return the number of steps, and the agent without an action at the end or -1."""
+    chosen = np.full(len(hidden), -1)
+    t = 0
+    reset(tables, battle, seed)
+    observe(tables, battle, rows.obs[t], rows.state[t], rows.mask[t], rows.alive[t])
+    stuck = first_stuck(rows.mask[t])
+    while stuck < 0 and not (battle.status[TERMINATED] or battle.status[TRUNCATED]):
+        act(policy, hidden, rows.obs[t], chosen, rows.mask[t], choice, chosen, rows.log_mu[t])
+        rows.actions[t] = chosen
+        rows.reward[t] = step(tables, battle, chosen)
+        t += 1
         observe(tables, battle, rows.obs[t], rows.state[t], rows.mask[t], rows.alive[t])
         stuck = first_stuck(rows.mask[t])
-        while stuck < 0 and not (battle.status[TERMINATED] or battle.status[TRUNCATED]):
-            act(policy, hidden, rows.obs[t], chosen, rows.mask[t], choice, chosen, rows.log_mu[t])
-            rows.actions[t] = chosen
-            rows.reward[t] = step(tables, battle, chosen)
-            t += 1
-            observe(tables, battle, rows.obs[t], rows.state[t], rows.mask[t], rows.alive[t])
-            stuck = first_stuck(rows.mask[t])
-        return t, stuck
-
-    return play_episode
-
-
-_play_episode = _compile(_sources())
+    return t, stuck
 
 
 class FusedPlayer(Player):

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import importlib
+from typing import Any
 
 from pettingzoo import ParallelEnv
 
 from liir_common import seeds
 from liir_common.battle.env import battle_spec, parallel_env
-from liir_common.config import ConfigError, EnvConfig
+from liir_common.config import EnvConfig
+from liir_common.errors import ConfigError
 from liir_common.rollout.fused import FusedPlayer
 from liir_common.rollout.loop import Env, LoopPlayer, loop_spec
 from liir_common.rollout.player import Player
@@ -20,12 +22,17 @@ def env_spec(env: EnvConfig) -> EnvSpec:
     """What the configured environment looks like from outside.
 
     Raises:
-        ConfigError: the factory cannot be imported or does not return a ParallelEnv.
-        ValueError: the map or an option is unknown, or the environment is of an unsupported kind.
+        ConfigError: the map, an option or the kind of environment is unknown, or the factory cannot be
+            imported or does not return a ParallelEnv.
     """
-    if env.kind == "battle":
-        return battle_spec(env.map, **env.options)
-    return loop_spec(_make(env), env.factory, env.options)
+    try:
+        if env.kind == "battle":
+            return battle_spec(env.map, **env.options)
+        return loop_spec(_make(env), env.factory, env.options)
+    except ConfigError:
+        raise
+    except ValueError as error:
+        raise ConfigError(f"env: {error}") from None
 
 
 def make_player(env: EnvConfig, policy_hidden: int = 64, fused: bool = True) -> Player:
@@ -34,12 +41,13 @@ def make_player(env: EnvConfig, policy_hidden: int = 64, fused: bool = True) -> 
     Raises:
         ConfigError, ValueError: as `env_spec`.
     """
-    if env.kind == "battle" and fused:
-        return FusedPlayer(env.map, env.options, policy_hidden)
-    if env.kind == "battle":
-        return LoopPlayer(parallel_env(env.map, **env.options), env_spec(env), policy_hidden)
-    game = _make(env)
-    return LoopPlayer(game, loop_spec(game, env.factory, env.options), policy_hidden)
+    options: dict[str, Any] = dict(env.options)
+    if env.kind == "pettingzoo":
+        game = _make(env)
+        return LoopPlayer(game, loop_spec(game, env.factory, options), policy_hidden)
+    if fused:
+        return FusedPlayer(env.map, options, policy_hidden)
+    return LoopPlayer(parallel_env(env.map, **options), env_spec(env), policy_hidden)
 
 
 def _make(env: EnvConfig) -> Env:

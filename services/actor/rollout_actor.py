@@ -19,7 +19,8 @@ from liir_common.rpc.gen.liir.v1 import rollout_pb2, rollout_pb2_grpc
 log = structlog.get_logger()
 
 _RETRIED = (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.CANCELLED)
-_NEXT_TICKET = rollout_pb2.PlayRequest(ready=rollout_pb2.Ready(tickets=1))
+_TICKETS_HELD = 2
+"""One being played and one here when it ends."""
 
 
 class RolloutActor:
@@ -63,7 +64,7 @@ class RolloutActor:
             actor_id=name, incarnation=incarnation, env_spec_hash=self._player.spec.hash, build=build()
         )
         outgoing.put(rollout_pb2.PlayRequest(hello=hello))
-        outgoing.put(_NEXT_TICKET)
+        outgoing.put(rollout_pb2.PlayRequest(ready=rollout_pb2.Ready(tickets=_TICKETS_HELD)))
         version, idle_since = -1, time.perf_counter()
         for message in learner.Play(iter(outgoing.get, None), wait_for_ready=True):
             match message.WhichOneof("body"):
@@ -71,7 +72,6 @@ class RolloutActor:
                     self._player.load(codec.decode_policy(message.policy, self._shapes))
                     version = message.policy.version
                 case "ticket":
-                    outgoing.put(_NEXT_TICKET)  # so that the next one is here when this episode ends
                     ticket = codec.decode_ticket(message.ticket)
                     if ticket.policy_version != version:
                         raise RuntimeError(f"got a ticket for policy {ticket.policy_version}, have {version}")

@@ -2,9 +2,101 @@
 
 from __future__ import annotations
 
-import numpy as np
+import statistics
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from typing import Any
 
+import numpy as np
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from liir_common.config import AlgorithmConfig
 from liir_common.types import Batch, EnvSpec, Trajectory
+from services.learner.algorithms import make_algorithm
+from services.learner.algorithms.runtime import set_up_process
+
+Layout = tuple[tuple[int, ...], tuple[int, ...]]
+"""Sizes and strides of a matrix"""
+_FACTORS = {"mm": slice(0, 2), "bmm": slice(0, 2), "addmm": slice(1, 3), "addmm_": slice(1, 3)}
+
+
+def bench_learner(
+    algorithm: AlgorithmConfig,
+    spec: EnvSpec,
+    episodes: int = 32,
+    steps: int = 25,
+    threads: Sequence[int] = (1, 2),
+    repeats: int = 30,
+) -> dict[str, Any]:
+    """Time learner steps on the CPU against their floor, the time of their matrix products alone.
+
+    The products, with sizes and memory layouts, are recorded from a real update and run again by themselves,
+    with the same threads in the same run. Floating point operations are two per multiply-add.
+
+    Returns:
+        env_steps and flops of the batch, and under "threads" for each count: update_ms and floor_ms (medians),
+        matmul_gflops (the rate of the products), square_gflops (that of a 1024 x 1024 product) and ratio, the
+        update over the floor.
+    """
+    batch = synthetic_batch(spec, episodes, steps, seed=0)
+    learner = make_algorithm(spec, algorithm, 0, torch.device("cpu"))
+    learner.update(batch)
+    with _Products() as products:
+        learner.update(batch)
+    flops = sum(_flops(*factors) * times for factors, times in products.seen.items())
+    before = torch.get_num_threads()
+    results = {}
+    for count in threads:
+        set_up_process(count)
+        update = _median_seconds(lambda: learner.update(batch), repeats)
+        floor = sum(_product_seconds(*factors, repeats) * times for factors, times in products.seen.items())
+        square: Layout = ((1024, 1024), (1024, 1))
+        results[count] = {
+            "update_ms": update * 1e3,
+            "floor_ms": floor * 1e3,
+            "ratio": update / floor,
+            "matmul_gflops": flops / floor / 1e9,
+            "square_gflops": _flops(square, square) / _product_seconds(square, square, repeats) / 1e9,
+        }
+    torch.set_num_threads(before)
+    return {"env_steps": batch.env_steps, "flops": flops, "threads": results}
+
+
+class _Products(TorchDispatchMode):
+    """Counts the matrix products that are computed while it is active."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seen: Counter[tuple[Layout, Layout]] = Counter()
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        name = func.overloadpacket.__name__
+        if name in _FACTORS:
+            a, b = args[_FACTORS[name]]
+            self.seen[(tuple(a.shape), a.stride()), (tuple(b.shape), b.stride())] += 1
+        return func(*args, **(kwargs or {}))
+
+
+def _flops(a: Layout, b: Layout) -> int:
+    return 2 * int(np.prod(a[0])) * b[0][-1]
+
+
+def _product_seconds(a: Layout, b: Layout, repeats: int) -> float:
+    left, right = (torch.empty_strided(*layout).normal_() for layout in (a, b))
+    out = left @ right
+    return _median_seconds(lambda: torch.matmul(left, right, out=out), repeats)
+
+
+def _median_seconds(run: Callable[[], object], repeats: int) -> float:
+    run()
+    seconds = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        run()
+        seconds.append(time.perf_counter() - start)
+    return statistics.median(seconds)
 
 
 def synthetic_batch(
@@ -43,5 +135,5 @@ def _episode(spec: EnvSpec, number: int, length: int, rng: np.random.Generator, 
         reward=rng.random(length).astype(np.float32),
         terminated=not truncated,
         truncated=truncated,
-        info={key: 0.0 for key in spec.info_keys},
+        info=dict.fromkeys(spec.info_keys, 0.0),
     )

@@ -6,6 +6,7 @@ not yet played are the actors' credits, so the memory behind them is bounded by 
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Hashable, Iterator
 from dataclasses import dataclass
@@ -47,14 +48,17 @@ class Intake:
         self._unplayed: dict[int, Ticket] = {}
         self._to_give: deque[int] = deque()
         self._held: dict[Actor, dict[int, float]] = {}
-        """Per actor, when each of its tickets was given."""
+        """Per actor, when each of its tickets was given; infinity once another has it too."""
+        self._credits: dict[Actor, int] = {}
+        """Per actor, how many tickets more it can hold."""
         self._asking: deque[Actor] = deque()
+        """Actors with credits, each once: all get a ticket before one gets its second."""
         self._played: dict[int, Trajectory] = {}
 
     @property
     def outstanding(self) -> int:
         """Tickets given out and not yet played."""
-        return len({episode for held in self._held.values() for episode in held})
+        return len(self._unplayed.keys() & {e for held in self._held.values() for e in held})
 
     def open(self, opening: Opening) -> None:
         """Make the next batch's tickets available."""
@@ -71,21 +75,21 @@ class Intake:
     def join(self, actor: Actor) -> None:
         """An actor is here."""
         self._held[actor] = {}
+        self._credits[actor] = 0
 
     def ask(self, actor: Actor, tickets: int) -> None:
-        """The actor wants that many tickets more."""
-        self._asking.extend([actor] * tickets)
+        """The actor can hold that many tickets more."""
+        if not self._credits[actor]:
+            self._asking.append(actor)
+        self._credits[actor] += tickets
 
     def assign(self, now: float) -> Iterator[tuple[Actor, Ticket]]:
         """Match tickets with actors, oldest episode and longest wait first."""
-        while self._to_give and self._asking:
+        while self._asking and (ticket := self._next_ticket()):
             actor = self._asking.popleft()
-            if actor not in self._held:
-                continue
-            ticket = self._next_ticket()
-            if ticket is None:
-                self._asking.appendleft(actor)
-                return
+            self._credits[actor] -= 1
+            if self._credits[actor]:
+                self._asking.append(actor)
             self._held[actor][ticket.episode_id] = now
             yield actor, ticket
 
@@ -105,7 +109,8 @@ class Intake:
         episode = trajectory.episode_id
         if episode >= self._opened:
             raise ValueError(f"episode {episode} was never ordered; the last ticket was {self._opened - 1}")
-        self._held[actor].pop(episode, None)
+        if self._held[actor].pop(episode, None) is not None:
+            self.ask(actor, 1)
         ticket = self._unplayed.get(episode)
         if ticket is None:
             return False
@@ -129,23 +134,21 @@ class Intake:
 
     def leave(self, actor: Actor) -> int:
         """The actor is gone; its unplayed tickets go to others. Returns how many."""
-        return self._give_again(self._held.pop(actor, {}))
+        if self._credits.pop(actor):
+            self._asking.remove(actor)
+        return self._give_again([e for e, given in self._held.pop(actor).items() if given < math.inf])
 
     def expire(self, given_before: float) -> int:
         """Give tickets that were given out before that time to others as well. Returns how many."""
-        late = {
-            episode: given
-            for held in self._held.values()
-            for episode, given in held.items()
-            if given < given_before
-        }
+        late = []
         for held in self._held.values():
-            for episode in late:
-                held.pop(episode, None)
+            for episode, given in held.items():
+                if given < given_before:
+                    held[episode] = math.inf
+                    late.append(episode)
         return self._give_again(late)
 
-    def _give_again(self, episodes: dict[int, float]) -> int:
-        held_elsewhere = {episode for held in self._held.values() for episode in held}
-        lost = sorted(e for e in episodes if e in self._unplayed and e not in held_elsewhere)
-        self._to_give.extendleft(reversed(lost))
-        return len(lost)
+    def _give_again(self, episodes: list[int]) -> int:
+        unplayed = sorted(episode for episode in episodes if episode in self._unplayed)
+        self._to_give.extendleft(reversed(unplayed))
+        return len(unplayed)

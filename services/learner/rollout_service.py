@@ -92,6 +92,7 @@ class RolloutService(rollout_pb2_grpc.RolloutServiceServicer):
         timeout = self._config.actors.ticket_timeout_s
         while True:
             await asyncio.sleep(min(_EXPIRY_CHECK_S, timeout))
+            metrics.TICKETS.set(self.outstanding)
             self._reissued(self._intake.expire(time.monotonic() - timeout), "timeout")
 
     async def Play(
@@ -172,7 +173,7 @@ class RolloutService(rollout_pb2_grpc.RolloutServiceServicer):
             metrics.DUPLICATES.inc()
         ack = rollout_pb2.Ack(episode_id=message.episode_id)
         stream.outgoing.put_nowait(rollout_pb2.PlayResponse(ack=ack))
-        metrics.TICKETS.set(self.outstanding)
+        self._assign()
 
     def _assign(self) -> None:
         for stream, ticket in self._intake.assign(time.monotonic()):

@@ -15,6 +15,7 @@ from pathlib import Path
 import psutil
 
 from liir_common.checkpoint import CheckpointStore
+from liir_common.client import TrainingClient
 from liir_common.config import Config, load
 
 LIIR = str(Path(sys.executable).with_name("liir"))
@@ -42,7 +43,11 @@ def arguments(settings: Sequence[str]) -> list[str]:
 def start(command: str, *rest: str) -> subprocess.Popen[str]:
     """Start `liir COMMAND …`; its output can be read when it has ended."""
     return subprocess.Popen(
-        [LIIR, command, *rest], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
+        [LIIR, command, *rest],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
     )
 
 
@@ -120,3 +125,8 @@ def digests(run_dir: Path) -> dict[int, str]:
 def config(*settings: str) -> Config:
     """The configuration of a small run."""
     return load(None, (*SMALL, *settings))
+
+
+def client(run_dir: Path) -> TrainingClient:
+    """A client of the learner of a run."""
+    return TrainingClient(endpoints(run_dir)["address"])

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import queue
 import socket
-import subprocess
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
 
@@ -23,7 +21,7 @@ from liir_common.errors import LiirError, UnreachableError
 from liir_common.rollout.play import make_player
 from liir_common.rpc import codec
 from liir_common.rpc.channel import CHANNEL_OPTIONS, connect
-from liir_common.rpc.gen.liir.v1 import checkpoint_pb2, rollout_pb2, rollout_pb2_grpc, training_pb2
+from liir_common.rpc.gen.liir.v1 import checkpoint_pb2, rollout_pb2, rollout_pb2_grpc
 from liir_common.types import Ticket, policy_shapes
 from tests.e2e import service
 
@@ -83,7 +81,11 @@ class Actor:
 def learner(tmp_path: Path) -> Iterator[tuple[str, Path]]:
     """Address and run directory of a learner whose batches have four episodes."""
     run_dir = tmp_path / "run"
-    settings = ("training.batch_episodes=4", "training.checkpoint_interval=6", "training.total_env_steps=2000")
+    settings = (
+        "training.batch_episodes=4",
+        "training.checkpoint_interval=6",
+        "training.total_env_steps=2000",
+    )
     process = service.start("learner", "--run-dir", str(run_dir), *service.arguments(settings))
     try:
         service.wait_for((run_dir / "endpoints.json").exists, "the learner's start")
@@ -95,8 +97,8 @@ def learner(tmp_path: Path) -> Iterator[tuple[str, Path]]:
 
 def play_batches(address: str, batches: int) -> None:
     with Actor(address) as actor:
+        actor.ask()
         for _ in range(4 * batches):
-            actor.ask()
             actor.send(actor.play(actor.order()))
             actor.receive("ack")
 
@@ -113,14 +115,12 @@ def test_play_stream(learner: tuple[str, Path]) -> None:
         assert tickets[2].seed == seeds.episode_seed(PLAYER.seed, seeds.TRAINING, 2)
         assert training.status().tickets_outstanding == 3
         actor.player.load(codec.decode_policy(first, policy_shapes(actor.player.spec, 64)))
-        for _ in range(2):
-            actor.send(actor.play(tickets[0]))
-            assert actor.receive("ack").ack.episode_id == 0
-        actor.ask()
-        for ticket in [*tickets[1:], codec.decode_ticket(actor.receive("ticket").ticket)]:
+        actor.send(actor.play(tickets[0]))
+        assert actor.receive("ack").ack.episode_id == 0
+        tickets.append(codec.decode_ticket(actor.receive("ticket").ticket))
+        for ticket in tickets:
             actor.send(actor.play(ticket))
-            actor.receive("ack")
-        actor.ask()
+            assert actor.receive("ack").ack.episode_id == ticket.episode_id
         assert actor.order().policy_version == 1
         assert training.status().learner_step == 1
         assert training.status().episodes == 4
@@ -284,14 +284,19 @@ def test_stop_saves_and_resume_goes_on(tmp_path: Path) -> None:
 def test_a_busy_port_is_an_error_that_says_what_to_do(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        for key, advice in (("learner.port", "learner.port=N"), ("learner.metrics_port", "learner.metrics_port=N")):
+        for key, advice in (
+            ("learner.port", "learner.port=N"),
+            ("learner.metrics_port", "learner.metrics_port=N"),
+        ):
             settings = service.arguments([f"{key}={port}"])
             process = service.start("learner", "--run-dir", str(tmp_path / key), *settings)
             assert advice in service.finish(process, code=2)
 
 
 def test_an_open_address_is_refused_unless_asked_for(tmp_path: Path) -> None:
-    process = service.start("learner", "--run-dir", str(tmp_path / "run"), *service.arguments(["learner.host=0.0.0.0"]))
+    process = service.start(
+        "learner", "--run-dir", str(tmp_path / "run"), *service.arguments(["learner.host=0.0.0.0"])
+    )
     assert "learner.insecure=true" in service.finish(process, code=2)
 
 

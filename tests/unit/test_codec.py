@@ -31,9 +31,7 @@ def test_trajectory_round_trip(compress: bool, length: int) -> None:
 
 def test_policy_round_trip() -> None:
     shapes = policy_shapes(SPEC, 8)
-    weights = {
-        name: np.random.default_rng(0).random(shape, np.float32) for name, shape in shapes.items()
-    }
+    weights = {name: np.random.default_rng(0).random(shape, np.float32) for name, shape in shapes.items()}
     decoded = codec.decode_policy(codec.encode_policy(4, weights), shapes)
     assert all(np.array_equal(decoded[name], weights[name]) for name in shapes)
 
@@ -95,7 +93,10 @@ def only_action_one() -> np.ndarray:
         ({"terminated": False, "truncated": False}, "wanted terminated or truncated"),
         ({"info": {"won": 1.0}}, "wanted 2 figures, got 1"),
         ({"info": {"won": 1.0, "score": float("inf")}}, "info: wanted finite"),
-        ({"obs": np.zeros((7, 2, 6), np.float32)}, r"obs: wanted float32 \[7, 2, 5\], got float32 \[7, 2, 6\]"),
+        (
+            {"obs": np.zeros((7, 2, 6), np.float32)},
+            r"obs: wanted float32 \[7, 2, 5\], got float32 \[7, 2, 6\]",
+        ),
         ({"alive": np.ones((6, 2), np.bool_)}, r"alive: wanted bool \[7, 2\]"),
         ({"reward": np.zeros(10, np.float32)}, "T in 1..9"),
         ({"reward": np.zeros(0, np.float32)}, "T in 1..9"),

@@ -106,7 +106,8 @@ def policy_probabilities(theta: Tensor, batch: Batch, hidden: int) -> Tensor:
         mask = torch.as_tensor(batch.mask[:, t])
         logits = (h @ p["fc2.weight"].T + p["fc2.bias"]).masked_fill(~mask, -1e30)
         softmax = torch.softmax(logits, -1)
-        out.append((1 - batch.epsilon) * softmax + batch.epsilon * mask / mask.sum(-1, keepdim=True))
+        floor = batch.epsilon * mask.double() / mask.sum(-1, keepdim=True)
+        out.append((1 - batch.epsilon) * softmax + floor)
         last = torch.eye(SPEC.n_actions, dtype=theta.dtype)[batch.actions[:, t]]
     return torch.stack(out, 1)
 
@@ -224,7 +225,9 @@ def policy_gradient(theta: Tensor, a: Tensor, batch: Batch, config: AlgorithmCon
 def outer_objective(theta: Tensor, batch: Batch, a_ex: Tensor, config: AlgorithmConfig) -> Tensor:
     """J with ∇J = (1/N) Σ w · min(ρ, 1) · A_ex · ∇log π."""
     w, n = weights_of(batch)
-    rho = (log_pi_of(policy_probabilities(theta, batch, config.policy_hidden), batch) - t64(batch.log_mu)).exp()
+    rho = (
+        log_pi_of(policy_probabilities(theta, batch, config.policy_hidden), batch) - t64(batch.log_mu)
+    ).exp()
     return (w * a_ex * torch.where(rho < 1, rho, 1 + rho.log())).sum() / n
 
 

@@ -1,9 +1,19 @@
-"""Compiled random streams: the same numbers as plain Python, apart from each other, uniform."""
+"""Compiled random streams: the same numbers as plain Python, apart from each other, uniform; and
+never those of a version of the package that is gone."""
+
+import importlib
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
+from numba.core.caching import FunctionCache
+from numba.core.dispatcher import Dispatcher
 
-from liir_common import rng, seeds
+from liir_common import kernel_cache, rng, seeds
 
 EDGES = [0, 1, 2, 12345, 2**31, 2**63 - 1, 2**63, 2**64 - 1]
 
@@ -53,3 +63,37 @@ def test_uniform_is_uniform() -> None:
     # 99 degrees of freedom: 99.99 % of uniform samples are below 160.
     assert chi_square < 160
     assert abs(np.corrcoef(draws[:-1], draws[1:])[0, 1]) < 4 / np.sqrt(len(draws))
+
+
+def test_code_compiled_before_a_change_of_another_file_is_not_used(tmp_path: Path) -> None:
+    # Numbers of seeds.py are compiled into the kernels of rng.py, whose own file stays as it is.
+    package = tmp_path / "liir_common"
+    ignored = shutil.ignore_patterns("__pycache__")
+    shutil.copytree(Path(rng.__file__).parent, package, ignore=ignored)
+    code = (
+        "import numpy as np; from liir_common import rng, seeds;"
+        "print(int(rng.mix(np.uint64(1))) == seeds.mix(1), rng.mix.stats.cache_hits.total())"
+    )
+
+    def run() -> str:
+        environment = os.environ | {"PYTHONPATH": str(tmp_path), "PYTHONDONTWRITEBYTECODE": "1"}
+        command = [sys.executable, "-c", code]
+        return subprocess.run(
+            command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
+        ).stdout
+
+    assert run().split() == ["True", "0"]
+    assert run().split() == ["True", "1"]
+    source = (package / "seeds.py").read_text(encoding="utf-8")
+    (package / "seeds.py").write_text(source.replace("0xBF58476D1CE4E5B9", "0xBF58476D1CE4E5BB"))
+    assert run().split() == ["True", "0"]
+
+
+def test_every_cached_kernel_of_the_package_is_watched() -> None:
+    for name in ("rng", "battle.engine", "battle.observation", "battle.policies", "rollout.policy"):
+        module = importlib.import_module(f"liir_common.{name}")
+        kernels = [value for value in vars(module).values() if isinstance(value, Dispatcher)]
+        cached = [kernel for kernel in kernels if isinstance(kernel._cache, FunctionCache)]
+        assert cached
+        stamps = {kernel._cache._impl.locator.get_source_stamp() for kernel in cached}
+        assert stamps == {kernel_cache.source_digest()}

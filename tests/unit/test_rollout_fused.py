@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from liir_common.battle.engine import STEPS
 from liir_common.battle.observation import observe
@@ -28,6 +29,7 @@ from liir_common.types import (
     expected_shape,
     trajectories_equal,
 )
+from tests.unit.test_rollout_policy import TorchPolicy
 
 HIDDEN = 64
 
@@ -75,6 +77,25 @@ def test_fused_is_bit_for_bit_the_loop(
         assert trajectories_equal(one, other), f"{order} differs in {differences(one, other)}"
         played.add(one.obs.tobytes())
     assert len(played) == 25
+
+
+@pytest.mark.parametrize("map_name", ["3m", "8m"])
+def test_torch_finds_log_mu_again_in_the_trajectory(map_name: str) -> None:
+    """What an importance weight of 1 rests on: h starts at 0, the last action is that of the step before."""
+    player = loaded(EnvConfig(map=map_name))
+    reference = TorchPolicy(player.spec, weights_for(player, seed=3))
+    for episode_id in range(5):
+        played = player.play(ticket(episode_id, epsilon=0.1))
+        last, hidden = np.full(player.spec.n_agents, -1), torch.zeros(player.spec.n_agents, HIDDEN)
+        for t in range(played.length):
+            with torch.no_grad():
+                logits, hidden = reference(played.obs[t], last, hidden)
+            available = torch.from_numpy(played.mask[t])
+            softmax = torch.softmax(logits.masked_fill(~available, -torch.inf), 1)
+            pi = 0.9 * softmax + 0.1 * available / available.sum(1, keepdim=True)
+            last = played.actions[t].astype(int)
+            log_pi = pi.gather(1, torch.from_numpy(last)[:, None])[:, 0].log()
+            np.testing.assert_allclose(played.log_mu[t], log_pi.numpy(), atol=2e-5)
 
 
 def test_trajectory_has_the_declared_shapes_and_one_end() -> None:
@@ -128,7 +149,7 @@ def test_threads_play_the_same_bytes() -> None:
 
 
 PLAY_ELSEWHERE = """
-from test_rollout_fused import EnvConfig, digest, loaded, ticket
+from tests.unit.test_rollout_fused import EnvConfig, digest, loaded, ticket
 player = loaded(EnvConfig(map="3m"))
 print(*(digest(player.play(ticket(i))) for i in (5, 2, 7)))
 """
@@ -142,9 +163,9 @@ def digest(trajectory: Trajectory) -> str:
 def test_another_process_plays_the_same_bytes() -> None:
     player = loaded(EnvConfig(map="3m"))
     here = [digest(player.play(ticket(i))) for i in (5, 2, 7)]
-    folder = __file__.rpartition("/")[0]
+    root = Path(__file__).parents[2]
     command = [sys.executable, "-c", PLAY_ELSEWHERE]
-    there = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)
+    there = subprocess.run(command, cwd=root, capture_output=True, text=True, check=True)
     assert there.stdout.split() == here
 
 
@@ -163,30 +184,6 @@ def test_an_agent_without_action_is_named_with_its_step(monkeypatch: pytest.Monk
 
 def test_the_interpreter_is_free_while_a_battle_is_played() -> None:
     assert fused._play_episode.targetoptions["nogil"]
-
-
-def test_changed_simulator_is_not_answered_from_the_cache() -> None:
-    class Codegen:
-        @staticmethod
-        def magic_tuple() -> tuple[str]:
-            return ("machine",)
-
-    one, same, changed = (
-        fused._compile(sources)._cache._index_key(("signature",), Codegen) for sources in ("a", "a", "b")
-    )
-    assert one == same
-    assert one != changed
-
-
-def test_sources_of_the_episode_are_all_that_it_is_compiled_from() -> None:
-    # Whatever of the package takes part in an episode is imported by then.
-    code = (
-        "import sys; from liir_common.rollout import fused;"
-        "print(*(m.__file__ for n, m in sys.modules.items() if n.startswith('liir_common.')))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    compiled = {path for path in done.stdout.split() if "njit" in Path(path).read_text(encoding="utf-8")}
-    assert compiled - {fused.__file__} <= {str(path) for path in fused.source_files()}
 
 
 def test_dead_agents_come_from_the_simulator() -> None:

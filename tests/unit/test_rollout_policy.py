@@ -216,7 +216,7 @@ def test_pack_refuses_what_does_not_fit() -> None:
     with pytest.raises(ValueError, match=r"fc1.weight: wanted float32 \(32, 42\)"):
         pack(weights, SPEC, hidden=32)
     with pytest.raises(ValueError, match=r"fc2.bias: wanted float32 .*, got float64"):
-        pack({**weights, "fc2.bias": weights["fc2.bias"].astype(np.float64)}, SPEC)  # type: ignore[dict-item]
+        pack({**weights, "fc2.bias": weights["fc2.bias"].astype(np.float64)}, SPEC)
     broken = weights["gru.bias_hh"].copy()
     broken[[3, 5]] = np.nan, np.inf
     with pytest.raises(ValueError, match=r"gru.bias_hh: 2 of 192 values are not finite"):

@@ -108,12 +108,13 @@ def test_equality_of_trajectories_sees_every_field() -> None:
         array.flat[-1] = 1 - array.flat[-1]
         assert not trajectories_equal(one, replace(one, **{name: array}))
     assert not trajectories_equal(one, replace(one, log_mu=one.log_mu.astype(np.float64)))
-    for change in ({"terminated": False}, {"policy_version": 1}, {"info": {"won": 0.0}}):
+    changes: list[dict[str, Any]] = [{"terminated": False}, {"policy_version": 1}, {"info": {"won": 0.0}}]
+    for change in changes:
         assert not trajectories_equal(one, replace(one, **change))
 
 
 def test_hash_of_a_spec_depends_on_every_field() -> None:
-    changes = [
+    changes: list[dict[str, Any]] = [
         {"name": "battle/8m"},
         {"version": "2"},
         {"options": '{"a":1}'},

@@ -30,10 +30,12 @@ class Data:
     """[R, O + A + n]: observation, one-hot last action (zeros at the start), one-hot agent id"""
     local: Tensor
     """[R, O + n]: observation, one-hot agent id"""
-    mask: Tensor
-    """[R, A], true where an action is available"""
+    floor: Tensor
+    """[A, R], ε / available actions, 0 where an action is not available"""
+    closed: Tensor
+    """[A, R], 0 where an action is available and else -∞"""
     actions: Tensor
-    """[R, 1]"""
+    """[1, R]"""
     log_mu: Tensor
     """[R]"""
     weight: Tensor
@@ -114,8 +116,9 @@ def prepare(
         rows=as_is((b * batch.reward.shape[1] + t) * spec.n_agents + i),
         inputs=floats(np.concatenate([obs, _last_actions(batch, b, t, i, spec.n_actions), ids], 1)),
         local=floats(np.concatenate([obs, ids], 1)),
-        mask=as_is(mask),
-        actions=as_is(actions[:, None]),
+        floor=floats((batch.epsilon * mask / mask.sum(1, keepdims=True)).T),
+        closed=floats(np.where(mask.T, 0.0, -np.inf)),
+        actions=as_is(actions[None]),
         log_mu=floats(batch.log_mu[b, t, i]),
         weight=floats(alive),
         count=float(alive.sum()),

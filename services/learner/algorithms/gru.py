@@ -1,116 +1,104 @@
-"""A GRU over lives of unequal length, with hand-written derivatives in both directions.
+"""A GRU over lives of unequal length, with its derivatives in both directions.
 
-Rows are packed: all sequences' first steps, then all second steps, and so on, the longest sequence
-first within each step, so that neither padding nor dead agents are computed. With the gates saved, the
-step h' = f(h, gates) is linear in its tangents (ḣ, ġi, ġh); `_linearise` has the coefficients, `backward`
-runs the linear recurrence towards the past, `jvp` towards the future.
+Rows are packed: all sequences' first steps, then all second steps, and so on, the longest sequence first
+within each step, so that neither padding nor dead agents are computed. Gates are in torch's order r, z, n.
+
+Around a trace the step h' = f(h, inputs) is linear in its tangents,
+
+    ḣ' = z·ḣ + to_n·ġi_n + Σ_gates to_gates·ġh, with ġi added to ġh for the gates r and z,
+
+where gi are the projected inputs and gh the recurrent sums. `backward` runs this recurrence towards the
+past, `forward_derivative` towards the future.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 
-def gru(inputs: Tensor, weight_hh: Tensor, bias_hh: Tensor, sizes: list[int]) -> Tensor:
-    """Hidden states [R, H] from projected inputs W_ih·x + b_ih [R, 3H] (gates r, z, n), starting at h = 0.
+@dataclass(frozen=True)
+class Trace:
+    """A run of the GRU and its linearisation."""
 
-    `sizes[t]` is the number of sequences that have a step t; it never grows, and R = Σ sizes.
+    sizes: list[int]
+    h: Tensor
+    """[R, H], hidden states"""
+    previous: Tensor
+    """[R, H], the hidden states they came from"""
+    z: Tensor
+    """[R, H]"""
+    to_n: Tensor
+    """[R, H]"""
+    to_gates: Tensor
+    """[R, 3, H]"""
+
+
+def forward(inputs: Tensor, weight: Tensor, bias_n: Tensor, sizes: list[int]) -> Trace:
+    """Run from h = 0.
+
+    Args:
+        inputs: [R, 3H], projected inputs with all biases but gate n's recurrent one; overwritten
+        weight: [3H, H], recurrent
+        bias_n: [H], recurrent bias of gate n
+        sizes: how many sequences have a step t; never grows, sums to R
     """
-    return _Gru.apply(inputs, weight_hh, bias_hh, sizes)  # type: ignore[no-any-return, no-untyped-call]
+    width = weight.shape[1]
+    weight_rz, weight_n = weight.t().split_with_sizes([2 * width, width], 1)
+    h_all, recurrent_n = inputs.new_empty(2, len(inputs), width)
+    r, z, n = inputs.chunk(3, 1)
+    h = inputs.new_zeros(sizes[0], width)
+    in_steps = (x.split_with_sizes(sizes) for x in (inputs[:, : 2 * width], r, z, n, recurrent_n, h_all))
+    for rz_t, r_t, z_t, n_t, recurrent_t, h_t in zip(*in_steps, strict=True):
+        h = h[: len(h_t)]
+        rz_t.addmm_(h, weight_rz).sigmoid_()
+        torch.addmm(bias_n, h, weight_n, out=recurrent_t)
+        n_t.addcmul_(r_t, recurrent_t).tanh_()
+        h = torch.lerp(n_t, h, z_t, out=h_t)
+    before = zip(h_all.split_with_sizes(sizes), sizes[1:], strict=False)
+    previous = torch.cat([torch.zeros_like(h_all[: sizes[0]]), *(h_t[:size] for h_t, size in before)])
+    not_z = 1 - z
+    to_n = (1 - n * n) * not_z
+    to_r = to_n * recurrent_n * r * (1 - r)
+    to_z = (previous - n) * z * not_z
+    return Trace(sizes, h_all, previous, z, to_n, torch.stack([to_r, to_z, to_n * r], 1))
 
 
-class _Gru(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, inputs: Tensor, weight: Tensor, bias: Tensor, sizes: list[int]) -> Tensor:
-        hidden = weight.shape[1]
-        h_all = inputs.new_empty(len(inputs), hidden)
-        gates = torch.empty_like(inputs)
-        recurrent = torch.empty_like(inputs)
-        h = inputs.new_zeros(sizes[0], hidden)
-        transposed = weight.t()
-        steps = zip(
-            sizes,
-            inputs[:, : 2 * hidden].split_with_sizes(sizes),
-            inputs[:, 2 * hidden :].split_with_sizes(sizes),
-            recurrent.split_with_sizes(sizes),
-            recurrent[:, : 2 * hidden].split_with_sizes(sizes),
-            recurrent[:, 2 * hidden :].split_with_sizes(sizes),
-            gates[:, : 2 * hidden].split_with_sizes(sizes),
-            gates[:, :hidden].split_with_sizes(sizes),
-            gates[:, hidden : 2 * hidden].split_with_sizes(sizes),
-            gates[:, 2 * hidden :].split_with_sizes(sizes),
-            h_all.split_with_sizes(sizes),
-            strict=True,
-        )
-        for size, in_rz, in_n, rec, rec_rz, rec_n, rz, r, z, n, out in steps:
-            h = h[:size]
-            torch.addmm(bias, h, transposed, out=rec)
-            torch.add(in_rz, rec_rz, out=rz).sigmoid_()
-            torch.addcmul(in_n, r, rec_n, out=n).tanh_()
-            h = torch.lerp(n, h, z, out=out)
-        ctx.saved = (weight, sizes, h_all, gates, recurrent)
-        return h_all
+def backward(trace: Trace, weight: Tensor, grad_h: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Gradients by `inputs` [R, 3H], `weight` [3H, H] and all recurrent biases [3H].
 
-    @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        weight, sizes, h_all, gates, recurrent = ctx.saved
-        previous = _previous(h_all, sizes)
-        z, to_n, to_gates = _linearise(previous, gates, recurrent)
-        grad = grad.clone()
-        grad_rec = torch.empty_like(to_gates)
-        carried = grad.new_zeros(0, weight.shape[1])
-        steps = zip(
-            grad.split_with_sizes(sizes),
-            z.split_with_sizes(sizes),
-            to_gates.split_with_sizes(sizes),
-            grad_rec.split_with_sizes(sizes),
-            strict=True,
-        )
-        for g, z_t, to_gates_t, out in reversed(list(steps)):
-            g[: len(carried)] += carried
-            torch.mul(g.unsqueeze(1), to_gates_t, out=out)
-            carried = torch.addmm(g * z_t, out.flatten(1), weight)
-        grad_in = torch.cat([grad_rec[:, :2].flatten(1), grad * to_n], 1)
-        grad_rec = grad_rec.flatten(1)
-        return grad_in, grad_rec.t() @ previous, grad_rec.sum(0), None
-
-    @staticmethod
-    def jvp(ctx: Any, inputs: Tensor, weight_dot: Tensor, bias_dot: Tensor, _: None) -> Tensor:
-        weight, sizes, h_all, gates, recurrent = ctx.saved
-        hidden = weight.shape[1]
-        previous = _previous(h_all, sizes)
-        z, to_n, to_gates = _linearise(previous, gates, recurrent)
-        own = torch.addmm(bias_dot, previous, weight_dot.t())
-        own[:, : 2 * hidden] += inputs[:, : 2 * hidden]
-        h_dots = (own.view_as(to_gates) * to_gates).sum(1).addcmul_(to_n, inputs[:, 2 * hidden :])
-        h_dot = h_dots.new_zeros(sizes[0], hidden)
-        transposed = weight.t()
-        steps = zip(
-            h_dots.split_with_sizes(sizes),
-            z.split_with_sizes(sizes),
-            to_gates.split_with_sizes(sizes),
-            strict=True,
-        )
-        for out, z_t, to_gates_t in steps:
-            h_dot = h_dot[: len(out)]
-            through = (h_dot @ transposed).view_as(to_gates_t).mul_(to_gates_t).sum(1)
-            h_dot = out.add_(through).addcmul_(z_t, h_dot)
-        return h_dots
+    `grad_h` [R, H], the gradient by the hidden states, is overwritten.
+    """
+    grad_gates = torch.empty_like(trace.to_gates)
+    in_steps = (x.split_with_sizes(trace.sizes) for x in (grad_h, trace.z, trace.to_gates, grad_gates))
+    after: Tensor | None = None
+    for grad_t, z_t, to_gates_t, gates_t in reversed(list(zip(*in_steps, strict=True))):
+        if after is not None:
+            grad_t[: len(after)] += after
+        torch.mul(grad_t.unsqueeze(1), to_gates_t, out=gates_t)
+        after = torch.addmm(grad_t * z_t, gates_t.flatten(1), weight)
+    gates = grad_gates.flatten(1)
+    grad_weight, grad_bias = gates.t() @ trace.previous, gates.sum(0)
+    # Gate n's input is not multiplied with r, as its recurrent sum is; the other gates' gradients agree.
+    torch.mul(grad_h, trace.to_n, out=grad_gates[:, 2])
+    return gates, grad_weight, grad_bias
 
 
-def _previous(h_all: Tensor, sizes: list[int]) -> Tensor:
-    """The hidden state that each row started from."""
-    steps = zip(h_all.split_with_sizes(sizes), sizes[1:], strict=False)
-    return torch.cat([torch.zeros_like(h_all[: sizes[0]]), *(h[:size] for h, size in steps)])
+def forward_derivative(trace: Trace, weight: Tensor, inputs: Tensor, recurrent: Tensor) -> Tensor:
+    """ḣ [R, H] for tangents of the projected inputs and, at constant h, of the recurrent sums, both [R, 3H].
 
-
-def _linearise(previous: Tensor, gates: Tensor, recurrent: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Coefficients of ḣ' = z·ḣ + to_n·ġi_n + Σ_gates to_gates·(ġh, plus ġi for r and z)."""
-    r, z, n = gates.chunk(3, 1)
-    to_n = (1 - z) * (1 - n * n)
-    to_r = to_n * recurrent[:, -r.shape[1] :] * r * (1 - r)
-    to_z = (previous - n) * z * (1 - z)
-    return z, to_n, torch.stack([to_r, to_z, to_n * r], 1)
+    `recurrent` is overwritten.
+    """
+    width = weight.shape[1]
+    recurrent[:, : 2 * width] += inputs[:, : 2 * width]
+    h_dots = (recurrent.view_as(trace.to_gates) * trace.to_gates).sum(1)
+    h_dots.addcmul_(trace.to_n, inputs[:, 2 * width :])
+    h_dot = h_dots.new_zeros(trace.sizes[0], width)
+    in_steps = (x.split_with_sizes(trace.sizes) for x in (h_dots, trace.z, trace.to_gates))
+    for h_dot_t, z_t, to_gates_t in zip(*in_steps, strict=True):
+        h_dot = h_dot[: len(h_dot_t)]
+        through_gates = (h_dot @ weight.t()).view_as(to_gates_t).mul_(to_gates_t).sum(1)
+        h_dot = h_dot_t.addcmul_(z_t, h_dot).add_(through_gates)
+    return h_dots

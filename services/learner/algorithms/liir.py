@@ -39,6 +39,7 @@ from services.learner.algorithms.networks import (
     initial,
 )
 from services.learner.algorithms.optim import Optimizer, Step
+from services.learner.algorithms.policy import Evaluation
 from services.learner.algorithms.state import prefixed, snapshot
 
 
@@ -52,8 +53,8 @@ class Inner:
     """V_φ [B, T+1, n]"""
     target: Tensor
     """V_φ [B, T+1, n] that returns are built from"""
-    theta: Tensor
-    """[P], θ before the step"""
+    before: Evaluation
+    """The policy before the step"""
     step: Step
 
 
@@ -112,22 +113,21 @@ class Liir(ActorCritic):
             r_in = self._intrinsic_reward(self._eta, data)
             proxy_return = self._proxy_return(data, r_in, target)
             a_proxy = self._advantage(data, proxy_return, value)
-        theta, step, metrics = self._policy.advance(data, a_proxy)
+        before, step, metrics = self._policy.advance(data, a_proxy)
         metrics |= self._reward_figures(data, r_in)
-        return Inner(batch, data, value, target, theta, step), proxy_return, metrics
+        return Inner(batch, data, value, target, before, step), proxy_return, metrics
 
     def _improve_reward(self, inner: Inner, judged: Data, a_ex: Tensor) -> dict[str, Tensor]:
         """η ascends ∇η J_ex, the extrinsic return at θ' being judged by the advantage `a_ex` of `judged`."""
         data = inner.data
         v = self._policy.extrinsic_gradient(judged, a_ex)  # Eq. (8)
-        log_pi, c = self._policy.linearised(inner.theta, inner.step.transpose(v), data)
-        rho = (log_pi - data.log_mu).exp()
+        c = self._policy.derivative(inner.before, data, inner.step.transpose(v))
 
         eta = self._eta.detach().requires_grad_()
         proxy_return = self._proxy_return(data, self._intrinsic_reward(eta, data), inner.target)
         a_proxy = self._advantage(data, proxy_return, inner.value)
         # Eq. (9): g is linear in the weights of ∇log π, and those in A_proxy.
-        s = data.mean(c * self._policy.score_weight(rho, a_proxy))
+        s = data.mean(c * self._policy.score_weight(inner.before, data, a_proxy))
         (gradient,) = torch.autograd.grad(s, eta)  # Eq. (7)
         self._eta_optimizer.ascend(gradient)
         return {
@@ -138,7 +138,7 @@ class Liir(ActorCritic):
 
     def _intrinsic_reward(self, eta: Tensor, data: Data) -> Tensor:
         """r_in(η; s_i, u_i) [R] of the living; the dead get none."""
-        return data.weight * self._reward(eta, data.local).gather(1, data.actions).squeeze(1)
+        return data.weight * self._reward(eta, data.local).gather(1, data.actions.t()).squeeze(1)
 
     def _proxy_return(self, data: Data, r_in: Tensor, target: Tensor) -> Tensor:
         r_proxy = data.reward + self._config.lambda_ * data.lives(r_in)  # Eq. (2)
@@ -194,7 +194,8 @@ class Liir(ActorCritic):
         batch = Batch(**named)
         value, target, theta, gradient, diagonal = (tensors[name].to(self._device) for name in _STEP)
         step = Step(gradient, diagonal, self._config.policy_optimizer.clip)
-        return Inner(batch, self._prepare(batch), value, target, theta, step)
+        data = self._prepare(batch)
+        return Inner(batch, data, value, target, self._policy.evaluate(theta, data), step)
 
 
 _BATCH = [field.name for field in fields(Batch)]
@@ -204,5 +205,5 @@ _PENDING = {*_STEP, *(f"batch.{name}" for name in _BATCH)}
 
 def _pack(inner: Inner) -> dict[str, Tensor]:
     batch = {f"batch.{name}": torch.from_numpy(np.asarray(getattr(inner.batch, name))) for name in _BATCH}
-    step = [inner.value, inner.target, inner.theta, inner.step.gradient, inner.step.diagonal]
+    step = [inner.value, inner.target, inner.before.theta, inner.step.gradient, inner.step.diagonal]
     return batch | dict(zip(_STEP, step, strict=True))

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from liir_common.types import EnvSpec, policy_shapes
-from services.learner.algorithms.gru import gru
+from liir_common.types import EnvSpec
 
 Shapes = Mapping[str, tuple[int, ...]]
 
@@ -72,23 +71,6 @@ def initial(
     return flat.to(device)
 
 
-class PolicyNetwork:
-    """FC - ReLU - GRU - FC over the packed rows of `Data`."""
-
-    head = "fc2"
-
-    def __init__(self, spec: EnvSpec, hidden: int) -> None:
-        self.shapes = policy_shapes(spec, hidden)
-
-    def __call__(self, flat: Tensor, inputs: Tensor, sizes: list[int]) -> Tensor:
-        """Logits [R, A] for inputs (observation, last action, agent id) [R, O + A + n]."""
-        p = views(flat, self.shapes)
-        x = functional.linear(inputs, p["fc1.weight"], p["fc1.bias"]).relu()
-        gates = functional.linear(x, p["gru.weight_ih"], p["gru.bias_ih"])
-        h = gru(gates, p["gru.weight_hh"], p["gru.bias_hh"], sizes)
-        return functional.linear(h, p["fc2.weight"], p["fc2.bias"])
-
-
 class Mlp:
     """FC - ReLU - FC - ReLU - FC."""
 
@@ -130,7 +112,7 @@ class AgentValue(Mlp):
             [x.shape[1], p["fc1.weight"].shape[1] - x.shape[1]], 1
         )
         # The state's part of the first layer is the same for all agents of a step.
-        first = functional.linear(x, of_state, p["fc1.bias"]).unsqueeze(1) + of_id.t()
+        first = functional.linear(x, of_state, p["fc1.bias"]).unsqueeze(1) + of_id.t().contiguous()
         return _above(p, first).squeeze(-1)
 
 

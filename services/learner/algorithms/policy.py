@@ -2,22 +2,41 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.autograd import forward_ad
 
 from liir_common.config import AlgorithmConfig
 from liir_common.types import EnvSpec
 from services.learner.algorithms.data import Data
-from services.learner.algorithms.networks import PolicyNetwork, arrays, initial
+from services.learner.algorithms.networks import arrays, initial
 from services.learner.algorithms.optim import Optimizer, Step
+from services.learner.algorithms.policy_network import PolicyNetwork, Trace
 from services.learner.algorithms.state import prefixed
 
 # Distance that the central difference moves θ, as a share of its norm: float32 rounding and curvature
 # balance there.
 _DIFFERENCE = 1e-3
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """The policy π = (1 - ε)·softmax + ε / available actions at one θ on the agents' rows of a batch."""
+
+    theta: Tensor
+    """[P]"""
+    trace: Trace
+    softmax: Tensor
+    """[A, R]"""
+    pi: Tensor
+    """[A, R]"""
+    log_pi: Tensor
+    """[R], log π(u_i | τ_i) of the actions taken"""
+    slope: Tensor
+    """[R], (1 - ε)·softmax(u) / π(u): d log π(u) = slope · (d logit(u) - Σ_a softmax(a)·d logit(a))"""
 
 
 class Policy:
@@ -48,72 +67,80 @@ class Policy:
         """float32 copies under the names of `policy_shapes`."""
         return arrays(self.theta, self._network.shapes)
 
-    def advance(self, data: Data, advantage: Tensor) -> tuple[Tensor, Step, dict[str, Tensor]]:
-        """Take the K policy steps of a batch along g(θ) = (1/N) Σ w · A · ∇log π, `advantage` A being [R].
+    def advance(self, data: Data, advantage: Tensor) -> tuple[Evaluation, Step, dict[str, Tensor]]:
+        """Take the K policy steps of a batch along g(θ), `advantage` being [R].
 
-        Returns θ [P] before the last step, that step and its figures.
+        Returns the policy before the last step, that step and its figures.
         """
         for _ in range(self._config.policy_epochs):
-            theta = self.theta.clone()
-            gradient, metrics = self._gradient(data, advantage)
-            step = self._optimizer.ascend(gradient)
-        return theta, step, metrics | {"policy_gradient_norm": step.norm}
-
-    def _gradient(self, data: Data, advantage: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        theta = self.theta.detach().requires_grad_()
-        log_pi, entropy = self._log_pi_and_entropy(theta, data)
-        log_rho = log_pi.detach() - data.log_mu
+            before = self.evaluate(self.theta.clone(), data)
+            weight = self.score_weight(before, data, advantage)
+            gradient, entropy = self._gradient(before, data, weight)
+            step = self._optimizer.ascend(gradient)  # Eq. (6)
+        log_rho = before.log_pi - data.log_mu
         rho = log_rho.exp()
-        weight = self.score_weight(rho, advantage)
-        mean_entropy = data.mean(entropy)
-        # Eq. (6)
-        objective = data.mean(weight * log_pi) + self._config.entropy * mean_entropy
-        (gradient,) = torch.autograd.grad(objective, theta)
-        return gradient, {
-            "policy_entropy": mean_entropy.detach(),
-            "policy_kl": data.mean(rho - 1 - log_rho),
-            "clip_fraction": data.mean((weight != rho * advantage).to(rho.dtype)),
-        }
+        return (
+            before,
+            step,
+            {
+                "policy_entropy": entropy,
+                "policy_kl": data.mean(rho - 1 - log_rho),
+                "policy_gradient_norm": step.norm,
+                "clip_fraction": data.mean((weight != rho * advantage).to(rho.dtype)),
+            },
+        )
 
     def extrinsic_gradient(self, data: Data, advantage: Tensor) -> Tensor:
         """v = (1/N) Σ w · ρ · A · ∇log π at the present θ [P]; ρ is truncated at 1, `advantage` A is [R]."""
-        theta = self.theta.detach().requires_grad_()
-        log_pi, _ = self._log_pi_and_entropy(theta, data)
-        rho = (log_pi.detach() - data.log_mu).exp().clamp(max=1)
-        (gradient,) = torch.autograd.grad(data.mean(rho * advantage * log_pi), theta)
-        return gradient
+        now = self.evaluate(self.theta, data)
+        rho = (now.log_pi - data.log_mu).exp().clamp(max=1)
+        return self._backward(now, self._score(now, data, rho * advantage))
 
-    def score_weight(self, rho: Tensor, advantage: Tensor) -> Tensor:
-        """What ∇log π is weighted with in a policy step [R]: the advantage times the corrected ratio."""
+    def score_weight(self, at: Evaluation, data: Data, advantage: Tensor) -> Tensor:
+        """What ∇log π is weighted with in a policy step [R]: the advantage [R] times the corrected ratio."""
+        rho = (at.log_pi - data.log_mu).exp()
         if self._config.policy_epochs == 1:
             return rho.clamp(max=1) * advantage
         clip = self._config.ratio_clip
         beyond = torch.where(advantage > 0, rho > 1 + clip, rho < 1 - clip)
         return (rho * advantage).masked_fill(beyond, 0)
 
-    @torch.no_grad()
-    def linearised(self, theta: Tensor, direction: Tensor, data: Data) -> tuple[Tensor, Tensor]:
-        """log π(u_i | τ_i) at `theta` [P] and its derivative along `direction` [P], both [R]."""
+    def evaluate(self, theta: Tensor, data: Data) -> Evaluation:
+        """The policy with parameters `theta` [P]."""
+        trace = self._network.forward(theta, data)
+        softmax = (trace.logits + data.closed).softmax(0)
+        pi = torch.add(data.floor, softmax, alpha=1 - data.epsilon)
+        chosen = pi.gather(0, data.actions)
+        slope = softmax.gather(0, data.actions) * (1 - data.epsilon) / chosen
+        return Evaluation(theta, trace, softmax, pi, chosen.log().squeeze(0), slope.squeeze(0))
+
+    def derivative(self, at: Evaluation, data: Data, direction: Tensor) -> Tensor:
+        """⟨direction, ∇log π(u_i | τ_i)⟩ [R] for a `direction` [P] of θ."""
         if self._config.meta_gradient == "difference":
-            length = torch.linalg.vector_norm(direction).clamp_min(torch.finfo(theta.dtype).eps)
-            width = _DIFFERENCE * torch.linalg.vector_norm(theta) / length
-            above, below = (self._log_pi(theta + h * direction, data) for h in (width, -width))
-            return (above + below) / 2, (above - below) / (2 * width)
-        with forward_ad.dual_level():
-            dual = forward_ad.make_dual(theta, direction)  # type: ignore[no-untyped-call]
-            log_pi, derivative = forward_ad.unpack_dual(self._log_pi(dual, data))  # type: ignore[no-untyped-call]
-        return log_pi, derivative
+            return self._difference(at, data, direction)
+        logits = self._network.forward_derivative(at.theta, at.trace, direction)
+        mean = (at.softmax * logits).sum(0)
+        return at.slope * (logits.gather(0, data.actions).squeeze(0) - mean)
 
-    def _log_pi(self, theta: Tensor, data: Data) -> Tensor:
-        return self._log_probs(theta, data).gather(1, data.actions).squeeze(1)
+    def _difference(self, at: Evaluation, data: Data, direction: Tensor) -> Tensor:
+        length = torch.linalg.vector_norm(direction).clamp_min(torch.finfo(direction.dtype).eps)
+        width = _DIFFERENCE * torch.linalg.vector_norm(at.theta) / length
+        above, below = (self.evaluate(at.theta + h * direction, data) for h in (width, -width))
+        difference: Tensor = (above.log_pi - below.log_pi) / (2 * width)
+        return difference
 
-    def _log_pi_and_entropy(self, theta: Tensor, data: Data) -> tuple[Tensor, Tensor]:
-        log_probs = self._log_probs(theta, data)
-        return log_probs.gather(1, data.actions).squeeze(1), -(log_probs.exp() * log_probs).sum(1)
+    def _gradient(self, at: Evaluation, data: Data, weight: Tensor) -> tuple[Tensor, Tensor]:
+        """g(θ) = (1/N) Σ w · (weight · ∇log π + entropy coefficient · ∇H) and the mean of the entropy H."""
+        log_pi = at.pi.clamp_min(torch.finfo(at.pi.dtype).tiny).log()
+        by_logits = at.softmax * ((at.softmax * log_pi).sum(0) - log_pi)
+        by_logits *= data.weight * (self._config.entropy * (1 - data.epsilon) / data.count)
+        entropy = data.mean(-(at.pi * log_pi).sum(0))
+        return self._backward(at, by_logits.add_(self._score(at, data, weight))), entropy
 
-    def _log_probs(self, theta: Tensor, data: Data) -> Tensor:
-        """log π of every action [R, A]; the logarithm of next to nothing where one is not available."""
-        logits = self._network(theta, data.inputs, data.sizes)
-        softmax = logits.masked_fill(~data.mask, -torch.inf).softmax(1)
-        floor = data.epsilon * data.mask / data.mask.sum(1, keepdim=True)
-        return torch.log(((1 - data.epsilon) * softmax + floor).clamp_min(torch.finfo(softmax.dtype).tiny))
+    def _score(self, at: Evaluation, data: Data, weight: Tensor) -> Tensor:
+        """Gradient by the logits [A, R] of (1/N) Σ w · weight · log π."""
+        scale = data.weight * weight * at.slope / data.count
+        return (at.softmax * -scale).scatter_add_(0, data.actions, scale.unsqueeze(0))
+
+    def _backward(self, at: Evaluation, grad_logits: Tensor) -> Tensor:
+        return self._network.backward(at.theta, at.trace, grad_logits)

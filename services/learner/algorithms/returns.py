@@ -22,9 +22,11 @@ def lambda_return(reward: Tensor, value: Tensor, filled: Tensor, gamma: float, g
     """
     delta = (reward + gamma * value[:, 1:] - value[:, :-1]) * filled.unsqueeze(-1)
     step = torch.arange(filled.shape[1], device=filled.device)
-    ahead = (step - step.unsqueeze(1)).clamp(min=0)
-    decay = ((gamma * gae_lambda) ** ahead.to(delta.dtype)).triu()
-    return value[:, :-1] + decay @ delta
+    distance = (step - step.unsqueeze(1)).clamp(min=0)
+    decay = ((gamma * gae_lambda) ** distance.to(delta.dtype)).triu()
+    # Contracting over time with all episodes side by side makes one large product of it.
+    summed: Tensor = torch.tensordot(delta, decay, ([1], [1]))
+    return value[:, :-1] + summed.transpose(1, 2)
 
 
 def normalize(advantage: Tensor, weight: Tensor) -> Tensor:

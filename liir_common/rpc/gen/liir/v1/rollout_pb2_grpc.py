@@ -47,9 +47,9 @@ class RolloutServiceServicer:
     """
 
     def Play(self, request_iterator, context):
-        """One stream per actor. The actor says hello, then asks for tickets with ready; the learner answers
-        with the policy of each version once, tickets, and an ack per trajectory. A ticket whose trajectory
-        was not acknowledged when the stream ends is given to another actor.
+        """One stream per actor. The actor says hello, then how many tickets it wants to hold at a time; the
+        learner answers with the policy of each version once, tickets, and an ack per trajectory, which makes
+        room for the next ticket. Tickets not played when the stream ends go to another actor.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

@@ -1,0 +1,212 @@
+"""`liir train` as a user runs it: whatever dies on the way, the same checkpoints come out.
+
+Every training here is real: learner, Ray actors and evaluator in processes of their own.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import time
+import urllib.request
+from collections.abc import Callable
+from pathlib import Path
+
+import psutil
+import pytest
+import yaml
+
+from tests.e2e import service
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run in which nothing went wrong."""
+    run_dir = tmp_path_factory.mktemp("undisturbed") / "run"
+    service.train(run_dir)
+    return run_dir
+
+
+def assert_same(run_dir: Path, undisturbed: Path) -> None:
+    """Equal checkpoints, each tested once and with the same result; every episode consumed once."""
+    assert service.digests(run_dir) == service.digests(undisturbed) != {}
+    assert evaluations(run_dir) == evaluations(undisturbed)
+    assert sorted(row["episode"] for row in evaluations(run_dir)) == sorted(
+        map(str, service.digests(run_dir))
+    )
+    rows = list(csv.DictReader((run_dir / "metrics.csv").open()))
+    assert [int(row["learner_step"]) for row in rows] == list(range(1, len(rows) + 1))
+    assert [int(row["episodes"]) for row in rows] == [8 * step for step in range(1, len(rows) + 1)]
+
+
+def evaluations(run_dir: Path) -> list[dict[str, str]]:
+    rows = list(csv.DictReader((run_dir / "evaluations.csv").open()))
+    return [{key: value for key, value in row.items() if key != "seconds"} for row in rows]
+
+
+def test_a_run_leaves_all_its_files(undisturbed: Path) -> None:
+    config = yaml.safe_load((undisturbed / "config.yaml").read_text())
+    assert config["training"]["batch_episodes"] == 8
+    steps = list(csv.DictReader((undisturbed / "metrics.csv").open()))
+    assert int(steps[-1]["env_steps"]) >= 6000 > int(steps[-2]["env_steps"])
+    assert {"return_mean", "reward_ratio", "eta_gradient_norm", "policy_lag"} <= set(steps[0])
+    assert {int(row["policy_lag"]) for row in steps} == {0}
+    episodes = int(steps[-1]["episodes"])
+    assert list(service.digests(undisturbed)) == list(range(20, episodes + 1, 20))
+    summary = json.loads((undisturbed / "summary.json").read_text())
+    assert summary["evaluations"] == len(service.digests(undisturbed))
+    assert (undisturbed / "winrate.png").read_bytes().startswith(b"\x89PNG")
+    for name in ("learner", "actors", "evaluator"):
+        for line in (undisturbed / "logs" / f"{name}.log").read_text().splitlines():
+            if line.startswith("{"):
+                assert "event" in json.loads(line)
+
+
+def test_five_actors_make_the_checkpoints_of_two(undisturbed: Path, tmp_path: Path) -> None:
+    service.train(tmp_path / "run", "actors.count=5")
+    assert_same(tmp_path / "run", undisturbed)
+
+
+def test_lag_one_is_deterministic_and_lags(tmp_path: Path) -> None:
+    for actors in (2, 5):
+        service.train(tmp_path / str(actors), f"actors.count={actors}", "training.lag=1")
+    assert service.digests(tmp_path / "2") == service.digests(tmp_path / "5") != {}
+    rows = list(csv.DictReader((tmp_path / "2" / "metrics.csv").open()))
+    assert [int(row["policy_lag"]) for row in rows] == [0] + [1] * (len(rows) - 1)
+
+
+def kill_actor(process: subprocess.Popen[str], run_dir: Path) -> None:
+    service.kill(service.descendants(process, "ray::RolloutActor")[0])
+
+
+def kill_driver(process: subprocess.Popen[str], run_dir: Path) -> None:
+    service.kill(service.descendants(process, "services.actor")[0])
+
+
+def kill_learner(process: subprocess.Popen[str], run_dir: Path) -> None:
+    service.kill(service.descendants(process, "services.learner")[0])
+
+
+def kill_evaluator(process: subprocess.Popen[str], run_dir: Path) -> None:
+    service.kill(service.descendants(process, "services.evaluator")[0])
+
+
+@pytest.mark.parametrize("kill", [kill_actor, kill_driver, kill_learner, kill_evaluator])
+def test_a_death_changes_nothing(
+    kill: Callable[[subprocess.Popen[str], Path], None], undisturbed: Path, tmp_path: Path
+) -> None:
+    run_dir = tmp_path / "run"
+    with service.training(run_dir) as process:
+        service.wait_for(lambda: service.learner_step(run_dir) >= 5, "the fifth learner step")
+        kill(process, run_dir)
+        service.finish(process)
+    assert_same(run_dir, undisturbed)
+
+
+def test_an_actor_killed_in_the_middle_of_an_episode_changes_nothing(
+    undisturbed: Path, tmp_path: Path
+) -> None:
+    """Both actors are stopped while they hold tickets, then killed before they can play them."""
+    run_dir = tmp_path / "run"
+    with service.training(run_dir) as process:
+        service.wait_for(lambda: service.learner_step(run_dir) >= 5, "the fifth learner step")
+        victims = service.descendants(process, "ray::RolloutActor")
+        assert len(victims) == 2
+        for victim in victims:
+            victim.suspend()
+        with service.client(run_dir) as training:
+            service.wait_for(lambda: training.status().tickets_outstanding > 0, "a ticket with an actor")
+        for victim in victims:
+            service.kill(victim)
+        service.finish(process)
+    assert_same(run_dir, undisturbed)
+
+
+def test_ctrl_c_saves_and_resume_ends_as_if_never_stopped(undisturbed: Path, tmp_path: Path) -> None:
+    run_dir = tmp_path / "run"
+    with service.training(run_dir) as process:
+        service.wait_for(lambda: service.learner_step(run_dir) >= 5, "the fifth learner step")
+        children = psutil.Process(process.pid).children(recursive=True)
+        process.send_signal(signal.SIGINT)
+        output = service.finish(process, code=128 + signal.SIGINT)
+    assert f"liir train --resume --run-dir {run_dir}" in output
+    _, left = psutil.wait_procs(children, timeout=10)
+    assert not left
+    assert len(service.digests(run_dir)) < len(service.digests(undisturbed))
+    service.train(run_dir, options=["--resume"])
+    assert_same(run_dir, undisturbed)
+
+
+def test_more_steps_for_a_complete_run_continue_it(undisturbed: Path, tmp_path: Path) -> None:
+    run_dir = tmp_path / "run"
+    service.train(run_dir, "training.total_env_steps=3000")
+    service.train(run_dir, options=["--resume"])
+    assert_same(run_dir, undisturbed)
+
+
+def test_the_evaluator_may_be_away_and_catches_up(undisturbed: Path, tmp_path: Path) -> None:
+    """Learner and actors alone, to the end of training; then an evaluator comes."""
+    run_dir = tmp_path / "run"
+    learner = service.start("learner", "--run-dir", str(run_dir), *service.arguments([]))
+    actors = None
+    try:
+        service.wait_for((run_dir / "endpoints.json").exists, "the learner's start")
+        address = service.endpoints(run_dir)["address"]
+        actors = service.start("actors", "--learner", address)
+        with service.client(run_dir) as training:
+            frozen = len(service.digests(undisturbed))
+            service.wait_for(lambda: training.status().checkpoints == frozen, "the last checkpoint")
+            assert training.status().evaluations == 0
+        service.finish(service.start("evaluator", "--learner", address))
+        service.finish(learner)
+        service.finish(actors)
+    finally:
+        for process in (learner, actors):
+            if process is not None and process.poll() is None:
+                process.kill()
+    assert_same(run_dir, undisturbed)
+
+
+def test_metrics_of_all_three_processes(tmp_path: Path) -> None:
+    run_dir = tmp_path / "run"
+    with service.training(run_dir, "training.total_env_steps=1000000") as process:
+        service.wait_for(lambda: service.learner_step(run_dir) >= 6, "the sixth learner step")
+        time.sleep(1)
+        names = ("learner", "actors", "evaluator")
+        pages = {name: scrape(run_dir / "logs" / f"{name}.log") for name in names}
+        process.send_signal(signal.SIGTERM)
+        service.finish(process, code=128 + signal.SIGTERM)
+    assert pages["learner"]['liir_env_steps_total{map="3m"}'] > 0
+    assert pages["learner"]["liir_learner_step"] >= 6
+    assert pages["learner"]["liir_actors_connected"] == 2
+    assert pages["learner"]["liir_actor_play_seconds_total"] > 0
+    assert pages["actors"]["liir_driver_actors_alive"] == 2
+    assert pages["evaluator"]['liir_evaluation_episodes_total{actions="greedy"}'] > 0
+
+
+def scrape(log: Path) -> dict[str, float]:
+    """Samples of a process's /metrics page, which its log names."""
+    lines = [json.loads(line) for line in log.read_text().splitlines() if line.startswith("{")]
+    url = next(line["url"] for line in lines if line["event"] == "serving metrics")
+    page = urllib.request.urlopen(url, timeout=5).read().decode()
+    samples = [line.rpartition(" ") for line in page.splitlines() if not line.startswith("#")]
+    return {name: float(value) for name, _, value in samples}
+
+
+def test_learner_away_at_start_is_a_clear_error() -> None:
+    for command in ("actors", "evaluator"):
+        process = service.start(command, "--learner", "127.0.0.1:9")
+        assert "no learner answered at 127.0.0.1:9" in service.finish(process, code=3)
+
+
+def test_a_launcher_that_is_killed_leaves_no_process(tmp_path: Path) -> None:
+    run_dir = tmp_path / "run"
+    with service.training(run_dir, "training.total_env_steps=1000000") as process:
+        service.wait_for(lambda: service.learner_step(run_dir) >= 2, "the second learner step")
+        children = psutil.Process(process.pid).children(recursive=True)
+        os.kill(process.pid, signal.SIGKILL)
+        _, left = psutil.wait_procs(children, timeout=30)
+        assert not left

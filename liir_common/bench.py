@@ -15,7 +15,7 @@ from typing import Any
 import psutil
 
 from liir_common.errors import LiirError
-from liir_common.files import Table
+from liir_common.files import read_table
 
 _WARM_UP_STEPS = 50_000
 _POLL_S = 0.1
@@ -54,7 +54,7 @@ def bench_train(map_name: str, env_steps: int, settings: Sequence[str] = ()) -> 
                 process.wait()
         if process.returncode:
             raise LiirError(f"the training ended with code {process.returncode}:\n{errors.decode()}")
-        rows = Table(run_dir / "metrics.csv").rows
+        rows = read_table(run_dir / "metrics.csv")
         return {
             "map": map_name,
             "env_steps_per_s": _rate(rows),
@@ -70,12 +70,13 @@ def bench_train(map_name: str, env_steps: int, settings: Sequence[str] = ()) -> 
 def _watch(process: subprocess.Popen[bytes], run_dir: Path, total: int) -> dict[str, float]:
     """Largest PSS of the learner and of an actor, MiB, read once in the second half of the run."""
     while process.poll() is None:
-        rows = Table(run_dir / "metrics.csv").rows if (run_dir / "metrics.csv").exists() else []
+        rows = read_table(run_dir / "metrics.csv")
         if rows and int(rows[-1]["env_steps"]) > total / 2:
             break
         time.sleep(_POLL_S * 10)
     largest = {"learner_pss_mib": 0.0, "actor_pss_mib": 0.0, "actors": 0.0}
-    for child in psutil.Process(process.pid).children(recursive=True):
+    children = [] if process.returncode else psutil.Process(process.pid).children(recursive=True)
+    for child in children:
         try:
             command, pss = " ".join(child.cmdline()), child.memory_full_info().pss / 2**20
         except (psutil.NoSuchProcess, psutil.AccessDenied):

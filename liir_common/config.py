@@ -179,8 +179,7 @@ class Config(BaseSettings):
         if isinstance(data.get("algorithm"), str):
             data = data | {"algorithm": {"name": data["algorithm"]}}
         preset = str(data.get("preset", "strong"))
-        base: dict[str, Any] = PRESETS.get(preset, {})
-        return merge(base, data)
+        return merge(PRESETS.get(preset, {}), data)
 
     @classmethod
     def settings_customise_sources(
@@ -230,8 +229,9 @@ def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     out = dict(base)
     for key, value in over.items():
         below = out.get(key)
-        both = isinstance(value, Mapping) and isinstance(below, Mapping)
-        out[key] = merge(below, value) if both else value
+        if isinstance(value, Mapping) and isinstance(below, Mapping):
+            value = merge(below, value)
+        out[key] = value
     return out
 
 

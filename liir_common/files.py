@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import csv
+import io
 import os
 import tempfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -25,44 +26,50 @@ def write_atomic(path: Path, data: bytes) -> None:
 
 
 class Table:
-    """A CSV file that grows by rows; its columns are fixed by the first row."""
+    """A CSV file that grows by rows. A row may bring new columns; what a row lacks stays empty."""
 
     def __init__(self, path: Path) -> None:
-        """Go on with the file at `path`, or begin it."""
+        """Go on with the file at `path`, or begin it; nobody else may write to it."""
         self.path = path
-        self.rows = _read(path)
-        self._columns: list[str] = list(self.rows[0]) if self.rows else []
+        rows = read_table(path)
+        self._columns = list(rows[0]) if rows else []
+        if rows:
+            self._rewrite(rows)  # without the row that a dying process may have left half-written
+
+    def read(self) -> list[dict[str, str]]:
+        """All rows, oldest first."""
+        return read_table(self.path)
 
     def append(self, row: Mapping[str, Any]) -> None:
-        """Add one row, flushed to the operating system; `row` must have the columns of the first."""
-        self.extend([row])
-
-    def extend(self, rows: Iterable[Mapping[str, Any]]) -> None:
-        """Add rows."""
+        """Add one row, flushed to the operating system."""
+        new = [column for column in row if column not in self._columns]
+        if new:
+            rows = self.read()
+            self._columns += new
+            self._rewrite(rows)
         with self.path.open("a", newline="", encoding="utf-8") as file:
-            for row in rows:
-                if not self._columns:
-                    self._columns = list(row)
-                    self._writer(file).writeheader()
-                self._writer(file).writerow(row)
-                self.rows.append({key: str(value) for key, value in row.items()})
+            self._writer(file).writerow(row)
 
     def keep(self, column: str, at_most: int) -> None:
         """Drop the rows whose `column` is larger; a resumed run writes them again."""
-        kept = [row for row in self.rows if int(row[column]) <= at_most]
-        self.path.unlink(missing_ok=True)
-        self.rows, self._columns = [], []
-        self.extend(kept)
+        rows = self.read()
+        kept = [row for row in rows if int(row[column]) <= at_most]
+        if len(kept) < len(rows):
+            self._rewrite(kept)
+
+    def _rewrite(self, rows: list[dict[str, str]]) -> None:
+        text = io.StringIO()
+        self._writer(text).writeheader()
+        self._writer(text).writerows(rows)
+        write_atomic(self.path, text.getvalue().encode())
 
     def _writer(self, file: TextIO) -> csv.DictWriter[str]:
         return csv.DictWriter(file, self._columns, lineterminator="\n")
 
 
-def _read(path: Path) -> list[dict[str, str]]:
+def read_table(path: Path) -> list[dict[str, str]]:
+    """All complete rows of a CSV file, which may be growing; none if it does not exist."""
     if not path.exists():
         return []
     text = path.read_text(encoding="utf-8")
-    whole = text[: text.rfind("\n") + 1]
-    if whole != text:  # the process that wrote the last row died in the middle of it
-        write_atomic(path, whole.encode())
-    return list(csv.DictReader(whole.splitlines()))
+    return list(csv.DictReader(text[: text.rfind("\n") + 1].splitlines()))

@@ -6,7 +6,7 @@ import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from liir_common.files import Table, write_atomic
+from liir_common.files import read_table, write_atomic
 
 _LEVEL = 0.9
 _IN_A_ROW = 3
@@ -35,8 +35,8 @@ class Summary:
 
 def summarise(run_dir: Path) -> Summary:
     """Read the figures of the run in `run_dir`."""
-    steps = Table(run_dir / "metrics.csv").rows
-    tests = sorted(Table(run_dir / "evaluations.csv").rows, key=lambda row: int(row["episode"]))
+    steps = read_table(run_dir / "metrics.csv")
+    tests = sorted(read_table(run_dir / "evaluations.csv"), key=lambda row: int(row["episode"]))
     greedy = [float(row["greedy_win_rate"]) for row in tests]
     sampled = [float(row["sampled_win_rate"]) for row in tests]
     first = _first(greedy, 1)
@@ -73,7 +73,7 @@ def plot_win_rate(groups: dict[str, list[Path]], output: Path) -> None:
     axes = figure.subplots()
     for number, (label, run_dirs) in enumerate(groups.items()):
         for run_dir in run_dirs:
-            tests = sorted(Table(run_dir / "evaluations.csv").rows, key=lambda row: int(row["episode"]))
+            tests = sorted(read_table(run_dir / "evaluations.csv"), key=lambda row: int(row["episode"]))
             steps = [int(row["env_steps"]) for row in tests]
             for actions, alpha in (("greedy", 1.0), ("sampled", 0.35)):
                 rates = [float(row[f"{actions}_win_rate"]) for row in tests]

@@ -182,7 +182,8 @@ def _play_loop(tables, battle):
     upwards = rng.next_u64(battle.stream) < _HALF
     walkers = 0
     for k in range(n):
-        i = k if upwards else n - 1 - k
+        # Unsigned, so that no index needs a test for being negative.
+        i = np.uint64(k if upwards else n - 1 - k)
         if battle.units[i].alive:
             walkers += _act(tables, battle, i, now, upwards)
     if tables.rules[0].has_missiles:

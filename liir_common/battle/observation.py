@@ -2,13 +2,15 @@
 
 import numpy as np
 
-from liir_common.battle.engine import NO_OP, STEPS, STOP
+from liir_common.battle.engine import NO_OP, NORTH, STEPS, STOP, WEST
 from liir_common.battle.tables import FIRST_ATTACK, SHOOT_RANGE, SIGHT, inlined, kernel
 
 MAP_SIZE = 32.0
 _CENTRE = MAP_SIZE / 2.0
 # Products instead of quotients, which take several times as long; float32 shows no difference.
 _PER_SIGHT = 1.0 / SIGHT
+SIGHT2, SHOOT_RANGE2 = SIGHT**2, SHOOT_RANGE**2
+_MOVES = WEST - STOP
 
 
 @kernel
@@ -19,8 +21,10 @@ def observe(tables, battle, obs, state, mask, alive):
     for i in range(tables.rules[0].n_allies):
         alive[i] = battle.units[i].alive
         if alive[i]:
-            _write_mask(tables, battle, i, mask[i])
-            _write_observation(tables, battle, i, obs[i], mask[i])
+            _write_moves(tables, battle, i, obs[i], mask[i])
+            at = _write_enemies(tables, battle, i, obs[i], mask[i], _MOVES)
+            at = _write_allies(tables, battle, i, obs[i], at)
+            _write_self(tables, battle, i, obs[i], at)
         else:
             mask[i, NO_OP] = True
         if tables.rules[0].obs_timestep_number:
@@ -29,16 +33,13 @@ def observe(tables, battle, obs, state, mask, alive):
 
 
 @inlined
-def _write_mask(tables, battle, i, mask):
-    """Moves look one cell ahead; attacks need a living enemy in SMAC v1's shoot range."""
-    x, y, n_allies = battle.x[i], battle.y[i], tables.rules[0].n_allies
+def _write_moves(tables, battle, i, obs, mask):
+    """A unit may move where the ground is open one cell ahead; the observation starts with that."""
     mask[STOP] = True
     for k in range(4):
-        mask[STOP + 1 + k] = _can_stand(tables.pathing, x + (k == 2) - (k == 3), y + (k == 0) - (k == 1))
-    for j in range(tables.rules[0].n_enemies):
-        enemy = n_allies + j
-        distance2 = (battle.x[enemy] - x) ** 2 + (battle.y[enemy] - y) ** 2
-        mask[FIRST_ATTACK + j] = battle.units[enemy].alive and distance2 <= SHOOT_RANGE**2
+        x = battle.x[i] + (k == 2) - (k == 3)
+        y = battle.y[i] + (k == 0) - (k == 1)
+        mask[NORTH + k] = obs[k] = _can_stand(tables.pathing, x, y)
 
 
 @inlined
@@ -48,55 +49,66 @@ def _can_stand(pathing, x, y):
 
 
 @inlined
-def _write_observation(tables, battle, i, obs, mask):
-    rules, units, specs = tables.rules[0], battle.units, tables.specs
-    at = 4
-    for k in range(at):
-        obs[k] = mask[STOP + 1 + k]
+def _write_enemies(tables, battle, i, obs, mask, at):
+    """Features and attack availability of all enemies; returns where the next features go."""
+    rules = tables.rules[0]
     width = 4 + rules.obs_all_health * (1 + rules.enemy_shields) + rules.enemy_bits
     for j in range(rules.n_enemies):
-        other, spec = units[rules.n_allies + j], specs[rules.n_allies + j]
-        if _write_seen(battle, i, rules.n_allies + j, obs, at):
-            obs[at] = mask[FIRST_ATTACK + j]
+        other, spec = battle.units[rules.n_allies + j], tables.specs[rules.n_allies + j]
+        distance2 = _write_place(battle, i, rules.n_allies + j, obs, at)
+        if distance2 < SIGHT2:
+            mask[FIRST_ATTACK + j] = obs[at] = distance2 <= SHOOT_RANGE2
             if rules.obs_all_health:
                 _write_health(other, spec, rules.enemy_shields, obs, at + 4)
             if rules.enemy_bits:
                 obs[at + width - rules.enemy_bits + spec.type_bit] = 1.0
         at += width
-    health = rules.obs_all_health * (1 + rules.ally_shields)
-    width = 4 + health + rules.ally_bits + rules.obs_last_action * rules.n_actions
-    for j in range(rules.n_allies):
-        if j != i:
-            other, spec = units[j], specs[j]
-            if _write_seen(battle, i, j, obs, at):
-                obs[at] = 1.0
-                if rules.obs_all_health:
-                    _write_health(other, spec, rules.ally_shields, obs, at + 4)
-                if rules.ally_bits:
-                    obs[at + 4 + health + spec.type_bit] = 1.0
-                if rules.obs_last_action and battle.last_actions[j] >= 0:
-                    obs[at + 4 + health + rules.ally_bits + battle.last_actions[j]] = 1.0
-            at += width
-    if rules.obs_own_health:
-        _write_health(units[i], specs[i], rules.ally_shields, obs, at)
-        at += 1 + rules.ally_shields
-    if rules.ally_bits:
-        obs[at + specs[i].type_bit] = 1.0
+    return at
 
 
 @inlined
-def _write_seen(battle, i, j, obs, at):
-    """Where unit j is for unit i, if it is alive and nearer than the sight range; whether it is."""
+def _write_allies(tables, battle, i, obs, at):
+    """Features of all other allies; returns where the next features go."""
+    rules = tables.rules[0]
+    bits = 4 + rules.obs_all_health * (1 + rules.ally_shields)
+    width = bits + rules.ally_bits + rules.obs_last_action * rules.n_actions
+    for j in range(rules.n_allies):
+        if j == i:
+            continue
+        if _write_place(battle, i, j, obs, at) < SIGHT2:
+            obs[at] = 1.0
+            if rules.obs_all_health:
+                _write_health(battle.units[j], tables.specs[j], rules.ally_shields, obs, at + 4)
+            if rules.ally_bits:
+                obs[at + bits + tables.specs[j].type_bit] = 1.0
+            if rules.obs_last_action and battle.last_actions[j] >= 0:
+                obs[at + bits + rules.ally_bits + battle.last_actions[j]] = 1.0
+        at += width
+    return at
+
+
+@inlined
+def _write_place(battle, i, j, obs, at):
+    """Where unit j is for unit i, if it is alive and in sight; returns the squared distance or infinity."""
     if not battle.units[j].alive:
-        return False
+        return np.inf
     x, y = battle.x[j] - battle.x[i], battle.y[j] - battle.y[i]
     distance2 = x * x + y * y
-    if distance2 >= SIGHT**2:
-        return False
-    obs[at + 1] = np.sqrt(distance2) * _PER_SIGHT
-    obs[at + 2] = x * _PER_SIGHT
-    obs[at + 3] = y * _PER_SIGHT
-    return True
+    if distance2 < SIGHT2:
+        obs[at + 1] = np.sqrt(distance2) * _PER_SIGHT
+        obs[at + 2] = x * _PER_SIGHT
+        obs[at + 3] = y * _PER_SIGHT
+    return distance2
+
+
+@inlined
+def _write_self(tables, battle, i, obs, at):
+    rules, spec = tables.rules[0], tables.specs[i]
+    if rules.obs_own_health:
+        _write_health(battle.units[i], spec, rules.ally_shields, obs, at)
+        at += 1 + rules.ally_shields
+    if rules.ally_bits:
+        obs[at + spec.type_bit] = 1.0
 
 
 @inlined

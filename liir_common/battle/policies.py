@@ -3,7 +3,6 @@
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from liir_common import rng, seeds
@@ -21,7 +20,7 @@ from liir_common.battle.engine import (
     step,
 )
 from liir_common.battle.observation import observe
-from liir_common.battle.tables import FIRST_ATTACK, Tables, inlined
+from liir_common.battle.tables import FIRST_ATTACK, Tables, build_battle, inlined, kernel
 
 RANDOM, STAND, STEP_ASIDE, CLOSEST_ENEMY = range(4)
 """Uniform over available actions; stop; north as long as possible; SMAC v1's built-in heuristic."""
@@ -53,33 +52,61 @@ def make_buffers(tables: Tables) -> Buffers:
     )
 
 
-@njit(cache=True, nogil=True)
-def play_episodes(tables, battle, buffers, policy, first_seed, outcomes):
-    """Play one episode per row of outcomes [E, 5]: length, return, won, dead allies, dead enemies."""
-    actions = np.zeros(len(buffers.alive), np.int64)
-    targets = np.zeros(len(buffers.alive), np.int64)
-    stream = np.zeros(1, np.uint64)
+class Memory(NamedTuple):
+    """What a scripted team keeps between steps."""
+
+    actions: NDArray[np.int64]
+    """[n]"""
+    targets: NDArray[np.int64]
+    """[n], enemy numbers or -1"""
+    stream: NDArray[np.uint64]
+    """[1]"""
+
+
+def play(tables: Tables, policy: int, episodes: int, seed: int = 0) -> NDArray[np.float64]:
+    """Play episodes with one of the policies above.
+
+    Returns:
+        Outcomes [episodes, 5]: length, return, won, dead allies, dead enemies.
+    """
+    n = int(tables.rules["n_allies"][0])
+    memory = Memory(np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros(1, np.uint64))
+    outcomes = np.zeros((episodes, 5))
+    play_episodes(
+        tables, build_battle(tables), make_buffers(tables), memory, policy, np.uint64(seed), outcomes
+    )
+    return outcomes
+
+
+@kernel
+def play_episodes(tables, battle, buffers, memory, policy, first_seed, outcomes):
+    """`play` with everything allocated, one episode per row of outcomes."""
     for episode in range(len(outcomes)):
         seed = rng.derive(first_seed, episode)
-        stream[0] = rng.derive(seed, seeds.POLICY)
-        reset(tables, battle, seed)
-        observe(tables, battle, buffers.obs, buffers.state, buffers.mask, buffers.alive)
-        targets[:] = -1
-        total = 0.0
-        while not (battle.status[TERMINATED] or battle.status[TRUNCATED]):
-            if policy == RANDOM:
-                _act_randomly(buffers.mask, stream, actions)
-            elif policy == CLOSEST_ENEMY:
-                _attack_closest(tables, battle, targets, actions)
-            else:
-                _act_always(NORTH if policy == STEP_ASIDE else STOP, buffers.mask, actions)
-            total += step(tables, battle, actions)
-            observe(tables, battle, buffers.obs, buffers.state, buffers.mask, buffers.alive)
+        outcomes[episode, 1] = _play_episode(tables, battle, buffers, memory, policy, seed)
         outcomes[episode, 0] = battle.status[STEPS]
-        outcomes[episode, 1] = total
         outcomes[episode, 2] = battle.status[WON]
         outcomes[episode, 3] = battle.status[DEAD_ALLIES]
         outcomes[episode, 4] = battle.status[DEAD_ENEMIES]
+
+
+@inlined
+def _play_episode(tables, battle, buffers, memory, policy, seed):
+    memory.stream[0] = rng.derive(seed, seeds.POLICY)
+    memory.targets[:] = -1
+    reset(tables, battle, seed)
+    observe(tables, battle, buffers.obs, buffers.state, buffers.mask, buffers.alive)
+    total = 0.0
+    while not (battle.status[TERMINATED] or battle.status[TRUNCATED]):
+        if policy == RANDOM:
+            _act_randomly(buffers.mask, memory.stream, memory.actions)
+        elif policy == CLOSEST_ENEMY:
+            _attack_closest(tables, battle, memory.targets, memory.actions)
+        else:
+            _act_always(NORTH if policy == STEP_ASIDE else STOP, buffers.mask, memory.actions)
+        total += step(tables, battle, memory.actions)
+        observe(tables, battle, buffers.obs, buffers.state, buffers.mask, buffers.alive)
+    return total
 
 
 @inlined

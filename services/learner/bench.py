@@ -36,25 +36,26 @@ def bench_learner(
     with the same threads in the same run. Floating point operations are two per multiply-add.
 
     Returns:
-        env_steps and flops of the batch, and under "threads" for each count: update_ms and floor_ms (medians),
-        matmul_gflops (the rate of the products), square_gflops (that of a 1024 x 1024 product) and ratio, the
-        update over the floor.
+        env_steps and flops of the batch, and under "threads" for each count the medians update_ms, cpu_ms
+        (the same in processor time) and floor_ms; ratio, update over floor; matmul_gflops, the rate of the
+        products, and square_gflops, that of a 1024 x 1024 product.
     """
     batch = synthetic_batch(spec, episodes, steps, seed=0)
     learner = make_algorithm(spec, algorithm, 0, torch.device("cpu"))
     learner.update(batch)
     with _Products() as products:
         learner.update(batch)
-    flops = sum(_flops(*factors) * times for factors, times in products.seen.items())
+    flops = sum(_flops(a, b) * times for (a, b), times in products.seen.items())
     before = torch.get_num_threads()
     results = {}
     for count in threads:
         set_up_process(count)
-        update = _median_seconds(lambda: learner.update(batch), repeats)
-        floor = sum(_product_seconds(*factors, repeats) * times for factors, times in products.seen.items())
+        update, cpu = _median_seconds(lambda: learner.update(batch), repeats)
+        floor = sum(_product_seconds(a, b, repeats) * times for (a, b), times in products.seen.items())
         square: Layout = ((1024, 1024), (1024, 1))
         results[count] = {
             "update_ms": update * 1e3,
+            "cpu_ms": cpu * 1e3,
             "floor_ms": floor * 1e3,
             "ratio": update / floor,
             "matmul_gflops": flops / floor / 1e9,
@@ -64,11 +65,11 @@ def bench_learner(
     return {"env_steps": batch.env_steps, "flops": flops, "threads": results}
 
 
-class _Products(TorchDispatchMode):
+class _Products(TorchDispatchMode):  # type: ignore[no-untyped-call]
     """Counts the matrix products that are computed while it is active."""
 
     def __init__(self) -> None:
-        super().__init__()
+        super().__init__()  # type: ignore[no-untyped-call]
         self.seen: Counter[tuple[Layout, Layout]] = Counter()
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
@@ -86,17 +87,19 @@ def _flops(a: Layout, b: Layout) -> int:
 def _product_seconds(a: Layout, b: Layout, repeats: int) -> float:
     left, right = (torch.empty_strided(*layout).normal_() for layout in (a, b))
     out = left @ right
-    return _median_seconds(lambda: torch.matmul(left, right, out=out), repeats)
+    return _median_seconds(lambda: torch.matmul(left, right, out=out), repeats)[0]
 
 
-def _median_seconds(run: Callable[[], object], repeats: int) -> float:
+def _median_seconds(run: Callable[[], object], repeats: int) -> tuple[float, float]:
+    """Median wall and processor time of a call."""
     run()
-    seconds = []
+    wall, cpu = [], []
     for _ in range(repeats):
-        start = time.perf_counter()
+        start = time.perf_counter(), time.process_time()
         run()
-        seconds.append(time.perf_counter() - start)
-    return statistics.median(seconds)
+        wall.append(time.perf_counter() - start[0])
+        cpu.append(time.process_time() - start[1])
+    return statistics.median(wall), statistics.median(cpu)
 
 
 def synthetic_batch(

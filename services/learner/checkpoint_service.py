@@ -28,7 +28,7 @@ class CheckpointService(checkpoint_pb2_grpc.CheckpointServiceServicer):
         self._changed = asyncio.Condition()
         self._complete = False
         self.evaluations = {
-            evaluation.episode: evaluation for evaluation in map(_from_row, run.evaluations.rows)
+            evaluation.episode: evaluation for evaluation in map(_from_row, run.evaluations.read())
         }
         self._show_evaluations()
 

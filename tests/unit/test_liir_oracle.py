@@ -5,6 +5,7 @@ The reference knows nothing of the learner's code: dense arrays, loops over time
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -271,18 +272,166 @@ def warmed(config: AlgorithmConfig) -> tuple[Algorithm, State]:
     return algorithm, algorithm.state()
 
 
+def fitted(state: State, name: str, returns: Tensor, batch: Batch, config: AlgorithmConfig) -> Tensor:
+    """The critic's parameters after its epochs, by torch's own optimiser."""
+    filled = torch.as_tensor(batch.filled)
+    target = returns[filled]
+    if config.normalize_values:
+        batch_moments = torch.stack([torch.ones(()).double(), target.mean(), (target**2).mean()])
+        state = state | {f"{name}.moments": 0.99 * state[f"{name}.moments"] + 0.01 * batch_moments}
+        total, first, second = state[f"{name}.moments"]
+        target = (target - first / total) / (second / total - (first / total) ** 2).sqrt()
+    parameters = torch.nn.Parameter(state[f"{name}.parameters"].clone())
+    c = config.critic_optimizer
+    optimizer = torch.optim.Adam([parameters], c.lr, (BETA_1, BETA_2), c.eps)
+    optimizer.state[parameters] = {
+        "step": state[f"{name}.optimizer.steps"].float().clone(),
+        "exp_avg": -state[f"{name}.optimizer.mean"],
+        "exp_avg_sq": state[f"{name}.optimizer.square"].clone(),
+    }
+    x = t64(batch.state[:, :-1])[filled]
+    if name == "phi":
+        x = torch.cat([x[:, None].expand(-1, SPEC.n_agents, -1), ids(len(x))], -1)
+    for _ in range(config.critic_epochs):
+        optimizer.zero_grad()
+        prediction = mlp(parameters, x, 1)
+        (prediction.squeeze(-1) if name == "phi" else prediction).sub(target).square().mean().backward()
+        optimizer.step()
+    return parameters.detach()
+
+
 @pytest.mark.parametrize("case", CASES)
 def test_update_equals_differentiating_through_the_inner_step(case: str) -> None:
     config = config_of(CASES[case])
     algorithm, before = warmed(config)
     batch = batch_of(9, 9)
     wanted = reference(before, batch, config)
-    algorithm.update(batch)
+    metrics = algorithm.update(batch)
     after = algorithm.state()
-    close(after["policy.parameters"], wanted.theta, 1e-12)
-    close(
-        after["policy.parameters"] - before["policy.parameters"],
-        wanted.theta - before["policy.parameters"],
-        1e-9,
-    )
+    moved = wanted.theta - before["policy.parameters"]
+    close(after["policy.parameters"] - before["policy.parameters"], moved, 1e-9)
     close(eta_gradient(before, after), wanted.eta_gradient, 1e-9)
+    close(after["phi.parameters"], fitted(before, "phi", wanted.proxy_return, batch, config), 1e-12)
+    close(after["varphi.parameters"], fitted(before, "varphi", wanted.extrinsic_return, batch, config), 1e-12)
+    # The case has to exercise what it is there for.
+    assert metrics["clip_fraction"] > 0.01
+    assert (metrics["policy_gradient_norm"] > config.policy_optimizer.clip) == (
+        config.policy_optimizer.clip < 1
+    )
+
+
+@pytest.mark.parametrize("case", ["td0", "rmsprop", "two steps"])
+def test_meta_gradient_equals_central_differences_of_eta(case: str) -> None:
+    config = config_of(CASES[case])
+    algorithm, before = warmed(config)
+    batch = batch_of(9, 9)
+    _, a_ex = extrinsic(before, batch, config)
+    wanted = reference(before, batch, config)
+    algorithm.update(batch)
+    gradient = eta_gradient(before, algorithm.state())
+    _, a_proxy = proxy(before["eta.parameters"], before, batch, config)
+    last = frozen_step(before, batch, a_proxy, config)
+
+    def outer(eta: Tensor) -> float:
+        _, a = proxy(eta, before, batch, config)
+        g = policy_gradient(wanted.theta_before.clone().requires_grad_(), a, batch, config).detach()
+        return float(outer_objective(wanted.theta_before + last(g), batch, a_ex, config))
+
+    for seed in range(3):
+        direction = torch.randn(gradient.shape, generator=torch.Generator().manual_seed(seed)).double()
+        direction = direction + gradient / gradient.norm() * direction.norm()
+        h = 1e-5 / float(direction.norm())
+        eta = before["eta.parameters"]
+        slope = (outer(eta + h * direction) - outer(eta - h * direction)) / (2 * h)
+        assert slope == pytest.approx(float(gradient @ direction), rel=1e-6)
+
+
+def frozen_step(state: State, batch: Batch, a: Tensor, config: AlgorithmConfig) -> Callable[[Tensor], Tensor]:
+    """The last policy step as a function of g, with the diagonal that it had."""
+    precondition = Preconditioner(state, config)
+    theta = state["policy.parameters"]
+    for _ in range(config.policy_epochs):
+        before = theta.detach().requires_grad_()
+        g = policy_gradient(before, a, batch, config).detach().requires_grad_()
+        step = precondition(g)
+        theta = before + step
+    c = config.policy_optimizer
+
+    def clipped(g: Tensor) -> Tensor:
+        return g * min(1.0, c.clip / float(g.norm()))
+
+    # The step is affine in the clipped gradient; its slope is its own derivative along each coordinate.
+    share = 1.0 if c.name == "rmsprop" else (1 - BETA_1) / (1 - BETA_1**precondition.steps)
+    square = precondition.square / (1.0 if c.name == "rmsprop" else 1 - BETA_2**precondition.steps)
+    diagonal = c.lr * share / (square.sqrt() + c.eps)
+    constant = step.detach() - diagonal * clipped(g.detach())
+    return lambda g: constant + diagonal * clipped(g)
+
+
+def test_fresh_samples_judge_the_step_one_batch_later() -> None:
+    config = config_of({"outer_samples": "fresh"})
+    algorithm, before = warmed(config)
+    first, second = batch_of(9, 9), batch_of(10, 10)
+    algorithm.update(first)
+    between = algorithm.state()
+    algorithm.update(second)
+    after = algorithm.state()
+
+    # The step on `first` was made with the η that `first` had just improved, and with the critics before it.
+    eta = between["eta.parameters"].clone().requires_grad_()
+    _, theta = inner_steps(eta, before, first, config)
+    close(theta.detach(), between["policy.parameters"], 1e-12)
+    _, a_ex = extrinsic(between, second, config)
+    (wanted,) = torch.autograd.grad(outer_objective(theta, second, a_ex, config), eta)
+    close(eta_gradient(between, after), wanted, 1e-9)
+
+
+def test_nothing_is_judged_before_fresh_samples_came() -> None:
+    algorithm = make_algorithm(SPEC, config_of({"outer_samples": "fresh"}), 5, CPU, torch.float64)
+    before = algorithm.state()
+    metrics = algorithm.update(batch_of(0))
+    assert torch.equal(algorithm.state()["eta.parameters"], before["eta.parameters"])
+    assert "eta_gradient_norm" not in metrics
+
+
+@pytest.mark.parametrize(("dtype", "rtol"), [(torch.float64, 1e-5), (torch.float32, 1e-3)])
+def test_central_difference_comes_close_to_forward_mode(dtype: torch.dtype, rtol: float) -> None:
+    gradients = []
+    for mode in ("jvp", "difference"):
+        algorithm = make_algorithm(SPEC, config_of({"meta_gradient": mode}), 5, CPU, dtype)
+        before = algorithm.state()
+        algorithm.update(batch_of(9))
+        gradients.append(eta_gradient(before, algorithm.state()))
+    assert not torch.equal(*gradients)
+    close(gradients[1], gradients[0], rtol)
+
+
+@pytest.mark.parametrize("control", [{"lambda": 0.0}, {"freeze_eta": True}])
+def test_controls_leave_the_intrinsic_reward_alone(control: dict[str, object]) -> None:
+    algorithm = make_algorithm(SPEC, config_of(control), 5, CPU, torch.float64)
+    before = algorithm.state()
+    for seed in range(3):
+        algorithm.update(batch_of(seed, seed))
+    after = algorithm.state()
+    assert torch.equal(after["eta.parameters"], before["eta.parameters"])
+    assert not torch.equal(after["policy.parameters"], before["policy.parameters"])
+
+
+def test_without_lambda_the_policy_learns_as_if_there_were_no_intrinsic_reward() -> None:
+    config = config_of({"lambda": 0.0})
+    algorithm, other = (make_algorithm(SPEC, config, 5, CPU, torch.float64) for _ in range(2))
+    state = other.state()
+    other.load_state(state | {"eta.parameters": torch.randn_like(state["eta.parameters"])})
+    for seed in range(2):
+        for learner in (algorithm, other):
+            learner.update(batch_of(seed, seed))
+    assert equal_but_for_eta(algorithm.state(), other.state())
+
+    before, batch = algorithm.state(), batch_of(9, 9)
+    _, theta = inner_steps(torch.zeros_like(before["eta.parameters"]), before, batch, config)
+    algorithm.update(batch)
+    close(algorithm.state()["policy.parameters"], theta.detach(), 1e-12)
+
+
+def equal_but_for_eta(a: State, b: State) -> bool:
+    return all(torch.equal(a[name], b[name]) for name in a if not name.startswith("eta."))

@@ -71,14 +71,14 @@ def backward(trace: Trace, weight: Tensor, grad_h: Tensor) -> tuple[Tensor, Tens
 
     `grad_h` [R, H], the gradient by the hidden states, is overwritten.
     """
-    grad_gates = torch.empty_like(trace.to_gates)
-    in_steps = (x.split_with_sizes(trace.sizes) for x in (grad_h, trace.z, trace.to_gates, grad_gates))
-    after: Tensor | None = None
-    for grad_t, z_t, to_gates_t, gates_t in reversed(list(zip(*in_steps, strict=True))):
-        if after is not None:
-            grad_t[: len(after)] += after
-        torch.mul(grad_t.unsqueeze(1), to_gates_t, out=gates_t)
-        after = torch.addmm(grad_t * z_t, gates_t.flatten(1), weight)
+    sizes, grad_gates = trace.sizes, torch.empty_like(trace.to_gates)
+    grads, z, to_gates, out = (
+        x.split_with_sizes(sizes) for x in (grad_h, trace.z, trace.to_gates, grad_gates)
+    )
+    for t in reversed(range(len(sizes))):
+        torch.mul(grads[t].unsqueeze(1), to_gates[t], out=out[t])
+        if t > 0:
+            grads[t - 1][: sizes[t]].addcmul_(grads[t], z[t]).addmm_(out[t].flatten(1), weight)
     gates = grad_gates.flatten(1)
     grad_weight, grad_bias = gates.t() @ trace.previous, gates.sum(0)
     # Gate n's input is not multiplied with r, as its recurrent sum is; the other gates' gradients agree.

@@ -25,7 +25,7 @@ class Trace:
     inputs: Tensor
     """[R, O + A + n]"""
     x: Tensor
-    """[R, H], what enters the GRU"""
+    """[R, H], what enters the GRU; its sign is the derivative of the ReLU that it left"""
     gru: gru.Trace
     logits: Tensor
     """[A, R]; this way round, because a softmax over few rows is many times faster than over few columns"""
@@ -63,7 +63,7 @@ class PolicyNetwork:
         grad["gru.bias_hh"].copy_(bias_hh)
         torch.mm(gates.t(), trace.x, out=grad["gru.weight_ih"])
         torch.sum(gates, 0, out=grad["gru.bias_ih"])
-        grad_x = (gates @ p["gru.weight_ih"]).mul_(trace.x > 0)
+        grad_x = (gates @ p["gru.weight_ih"]).mul_(trace.x.sign())
         torch.mm(grad_x.t(), trace.inputs, out=grad["fc1.weight"])
         torch.sum(grad_x, 0, out=grad["fc1.bias"])
         return out
@@ -71,7 +71,7 @@ class PolicyNetwork:
     def forward_derivative(self, theta: Tensor, trace: Trace, direction: Tensor) -> Tensor:
         """How the logits [A, R] change as θ moves along `direction` [P]."""
         p, d = views(theta, self.shapes), views(direction, self.shapes)
-        x = functional.linear(trace.inputs, d["fc1.weight"], d["fc1.bias"]).mul_(trace.x > 0)
+        x = functional.linear(trace.inputs, d["fc1.weight"], d["fc1.bias"]).mul_(trace.x.sign())
         inputs = functional.linear(trace.x, d["gru.weight_ih"], d["gru.bias_ih"])
         inputs.addmm_(x, p["gru.weight_ih"].t())
         recurrent = functional.linear(trace.gru.previous, d["gru.weight_hh"], d["gru.bias_hh"])

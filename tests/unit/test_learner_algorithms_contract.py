@@ -1,0 +1,253 @@
+"""What the rest of the service counts on, for every method: state, determinism, indifference to padding."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from liir_common.config import PRESETS, AlgorithmConfig
+from liir_common.types import Batch, EnvSpec, policy_shapes
+from services.learner.algorithms import Algorithm, make_algorithm
+from services.learner.bench import bench_learner, synthetic_batch
+
+SPEC = EnvSpec("test", "1", "{}", 3, 4, 3, 5, 9, ())
+CPU = torch.device("cpu")
+METHODS: dict[str, dict[str, object]] = {
+    "liir": {"lambda": 1.0, "r_in_gain": 1.0},
+    "liir fresh": {"lambda": 1.0, "outer_samples": "fresh"},
+    "liir paper": PRESETS["paper"]["algorithm"] | {"lambda": 1.0, "target_interval": 3},
+    "liir difference": {"lambda": 1.0, "meta_gradient": "difference"},
+    "central_v": {"name": "central_v"},
+    "central_v bootstrapped": {"name": "central_v", "limit_is_terminal": False},
+}
+
+
+def make(method: str, seed: int = 5) -> Algorithm:
+    config = AlgorithmConfig.model_validate({"policy_hidden": 8, "policy_gain": 1.0} | METHODS[method])
+    return make_algorithm(SPEC, config, seed, CPU)
+
+
+def batch_of(seed: int) -> Batch:
+    return synthetic_batch(SPEC, episodes=6, steps=6, seed=seed, policy_version=seed, epsilon=0.2)
+
+
+def assert_equal_states(a: Algorithm, b: Algorithm) -> None:
+    x, y = a.state(), b.state()
+    assert x.keys() == y.keys()
+    assert [name for name in x if not torch.equal(x[name], y[name])] == []
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_going_on_from_a_saved_state_equals_never_having_stopped(method: str) -> None:
+    straight = make(method)
+    for seed in range(4):
+        straight.update(batch_of(seed))
+    saved = straight.state()
+    resumed = make(method, seed=6)
+    resumed.update(batch_of(7))
+    resumed.load_state(saved)
+    assert_equal_states(straight, resumed)
+    for seed in range(4, 8):
+        assert straight.update(batch_of(seed)) == resumed.update(batch_of(seed))
+        assert_equal_states(straight, resumed)
+    assert any(not torch.equal(saved[name], value) for name, value in straight.state().items())
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_saved_state_is_a_copy(method: str) -> None:
+    algorithm = make(method)
+    algorithm.update(batch_of(0))
+    saved = algorithm.state()
+    kept = {name: value.clone() for name, value in saved.items()}
+    algorithm.update(batch_of(1))
+    assert all(torch.equal(saved[name], kept[name]) for name in saved)
+
+
+def test_states_of_something_else_are_refused() -> None:
+    algorithm = make("liir")
+    before = algorithm.state()
+    other_shape = before | {"phi.parameters": torch.zeros(3)}
+    without = {name: value for name, value in before.items() if name != "eta.optimizer.mean"}
+    other_type = before | {"phi.parameters": before["phi.parameters"].double()}
+    fresh = make("liir fresh")
+    fresh.update(batch_of(0))
+    for state, message in [
+        (make("central_v").state(), "missing .*eta.parameters"),
+        (without, r"missing \['eta.optimizer.mean'\]"),
+        (other_shape, r"phi.parameters wants .* got \(\(3,\)"),
+        (other_type, "float64"),
+        (fresh.state(), "unknown .*pending"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            algorithm.load_state(state)
+    after = algorithm.state()
+    assert all(torch.equal(before[name], after[name]) for name in before)
+
+
+def with_garbage(batch: Batch, *, dead: bool) -> Batch:
+    """The batch with other values wherever nothing was played and, if `dead`, in the rows of the dead.
+
+    A terminal state, and observations and masks of every last row, are not looked at either.
+    """
+    rng = np.random.default_rng(0)
+    lengths = batch.filled.sum(1)
+    rows = np.arange(batch.filled.shape[1] + 1)
+    after = rows >= lengths[:, None]
+    beyond = rows > lengths[:, None]
+    ended = beyond | (after & ~batch.truncated.any(1)[:, None])
+    agents = after[..., None] | (~batch.alive if dead else False)
+
+    def garbage(array: np.ndarray, where: np.ndarray) -> np.ndarray:
+        out = array.copy()
+        noise = rng.integers(2, 50, array.shape)
+        where = where.reshape(where.shape + (1,) * (array.ndim - where.ndim))
+        np.copyto(out, noise.astype(array.dtype), where=np.broadcast_to(where, array.shape))
+        return out
+
+    return replace(
+        batch,
+        obs=garbage(batch.obs, agents),
+        state=garbage(batch.state, ended),
+        mask=garbage(batch.mask, agents),
+        alive=garbage(batch.alive, after),
+        actions=garbage(batch.actions, agents[:, :-1]) % SPEC.n_actions,
+        log_mu=garbage(batch.log_mu, agents[:, :-1]),
+        reward=garbage(batch.reward, after[:, :-1]),
+    )
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("dead", [False, True])
+def test_garbage_after_the_mask_changes_nothing(method: str, dead: bool) -> None:
+    clean, dirty = make(method), make(method)
+    for seed in range(3):
+        batch = batch_of(seed)
+        garbage = with_garbage(batch, dead=dead)
+        assert not np.array_equal(batch.obs, garbage.obs)
+        assert clean.update(batch) == dirty.update(garbage)
+    x, y = clean.state(), dirty.state()
+    wrong = [name for name in x if not name.startswith("pending.batch") and not torch.equal(x[name], y[name])]
+    assert wrong == []
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_life_may_have_a_gap(method: str) -> None:
+    """What happens within it matters to the GRU, but what was done there counts for nothing."""
+    batch = batch_of(1)
+    b, t, i = (int(x[0]) for x in np.nonzero(batch.alive[:, 2:-1] & batch.filled[:, 2:, None]))
+    alive = batch.alive.copy()
+    alive[b, t + 1, i] = False
+    assert alive[b, t + 2, i]
+    batch = replace(batch, alive=alive)
+    log_mu = batch.log_mu.copy()
+    log_mu[b, t + 1, i] = -3
+    clean, dirty = make(method), make(method)
+    assert clean.update(batch) == dirty.update(replace(batch, log_mu=log_mu))
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_dead_still_teach_the_values(method: str) -> None:
+    """The team's reward goes on after an agent's death, so its steps are in the critics' targets."""
+    batch = batch_of(2)
+    alive = batch.alive.copy()
+    alive[:, 3:, 1:] = False
+    batch = replace(batch, alive=alive, mask=batch.mask | ~alive[..., None])
+    late = batch.reward.copy()
+    late[:, 3:] += batch.filled[:, 3:]
+    other, base = make(method), make(method)
+    base.update(batch)
+    other.update(replace(batch, reward=late))
+    name = "varphi.parameters" if method.startswith("central_v") else "phi.parameters"
+    assert not torch.equal(base.state()[name], other.state()[name])
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_equal_seeds_learn_equally_and_leave_global_randomness_alone(method: str) -> None:
+    torch.manual_seed(1)
+    before = torch.get_rng_state()
+    first = make(method)
+    first.update(batch_of(0))
+    assert torch.equal(before, torch.get_rng_state())
+    torch.manual_seed(2)
+    second = make(method)
+    second.update(batch_of(0))
+    assert_equal_states(first, second)
+    assert not np.array_equal(first.policy()["fc1.weight"], make(method, seed=6).policy()["fc1.weight"])
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_policy_has_the_agreed_names_shapes_and_type(method: str) -> None:
+    algorithm = make(method)
+    weights = algorithm.policy()
+    assert {name: array.shape for name, array in weights.items()} == policy_shapes(SPEC, 8)
+    assert {array.dtype for array in weights.values()} == {np.dtype(np.float32)}
+    kept = weights["fc1.weight"].copy()
+    algorithm.update(batch_of(0))
+    assert np.array_equal(weights["fc1.weight"], kept)
+    assert bool(algorithm.intrinsic()) == method.startswith("liir")
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_refused_batch_changes_nothing(method: str) -> None:
+    algorithm = make(method)
+    algorithm.update(batch_of(0))
+    before = algorithm.state()
+    with pytest.raises(ValueError, match="mask without any"):
+        algorithm.update(replace(batch_of(1), mask=np.zeros_like(batch_of(1).mask)))
+    after = algorithm.state()
+    assert all(torch.equal(before[name], after[name]) for name in before)
+
+
+def test_divergence_is_an_error() -> None:
+    algorithm = make("liir")
+    batch = batch_of(0)
+    with pytest.raises(FloatingPointError, match="diverged"):
+        algorithm.update(replace(batch, reward=batch.reward + np.float32(np.inf)))
+
+
+def test_the_reward_ratio_is_left_out_where_no_extrinsic_reward_came() -> None:
+    batch = batch_of(0)
+    assert "reward_ratio" in make("liir").update(batch)
+    assert "reward_ratio" not in make("liir").update(replace(batch, reward=batch.reward * 0))
+
+
+SIZES = {
+    # map: agents, actions, observation, state, then θ and budget
+    "3m": (3, 9, 30, 21, 28297, 31625),
+    "8m": (8, 14, 80, 56, 32462, 65550),
+    "2s3z": (5, 11, 80, 65, 31883, 51339),
+    "3s5z": (8, 14, 128, 104, 35534, 77838),
+}
+
+
+@pytest.mark.parametrize("name", ["liir", "central_v"])
+@pytest.mark.parametrize("battle", SIZES)
+def test_parameters_meet_the_budget(battle: str, name: str) -> None:
+    n, actions, obs, state, theta, budget = SIZES[battle]
+    spec = EnvSpec(battle, "1", "{}", n, actions, obs, state, 60, ())
+    algorithm = make_algorithm(spec, AlgorithmConfig(name=name), 1, CPU)
+    counts = algorithm.parameter_counts()
+    assert counts["theta"] == theta == sum(w.size for w in algorithm.policy().values())
+    assert counts["eta"] == sum(w.size for w in algorithm.intrinsic().values())
+    assert counts["budget"] == budget
+    assert counts["eta"] + counts["phi"] + counts["varphi"] == pytest.approx(budget, rel=0.01)
+    saved = algorithm.state()
+    for part, key in [("theta", "policy"), ("eta", "eta"), ("phi", "phi"), ("varphi", "varphi")]:
+        assert counts[part] == sum(v.numel() for k, v in saved.items() if k == f"{key}.parameters")
+
+
+def test_the_bench_counts_what_is_computed() -> None:
+    config = AlgorithmConfig(name="central_v", policy_epochs=1, critic_epochs=1, policy_hidden=8)
+    once = bench_learner(config, SPEC, episodes=4, steps=6, threads=(1,), repeats=2)
+    more = config.model_copy(update={"policy_epochs": 3})
+    thrice = bench_learner(more, SPEC, episodes=4, steps=6, threads=(1,), repeats=2)
+    batch = synthetic_batch(SPEC, 4, 6, seed=0)
+    rows = int((batch.alive[:, :-1] & batch.filled[..., None]).sum())
+    # Per row and multiply-add: forward, and backward without the gradient by the inputs of the first layer.
+    first, rest = 10 * 8, 2 * 24 * 8 + 8 * 4
+    assert (thrice["flops"] - once["flops"]) / 2 == pytest.approx(2 * rows * (2 * first + 3 * rest), rel=0.05)
+    figures = once["threads"][1]
+    assert figures["ratio"] == pytest.approx(figures["update_ms"] / figures["floor_ms"])

@@ -1,0 +1,55 @@
+"""Summary and curve of a run, from its files alone."""
+
+from pathlib import Path
+
+import pytest
+
+from liir_common.files import Table
+from liir_common.report import summarise, write_report
+
+
+def make_run(path: Path, greedy: list[float]) -> Path:
+    path.mkdir()
+    Table(path / "metrics.csv").append({"learner_step": 7, "env_steps": 900, "episodes": 56})
+    table = Table(path / "evaluations.csv")
+    for index, rate in reversed(list(enumerate(greedy, start=1))):  # reports may come in any order
+        table.append(
+            {
+                "episode": 100 * index,
+                "env_steps": 1000 * index,
+                "seconds": 2.0 * index,
+                "greedy_win_rate": rate,
+                "sampled_win_rate": rate / 2,
+            }
+        )
+    return path
+
+
+def test_levels_want_one_and_three_in_a_row(tmp_path: Path) -> None:
+    summary = summarise(make_run(tmp_path / "run", [0.0, 0.95, 0.5, 0.9, 1.0, 0.9, 0.2]))
+    assert (summary.learner_steps, summary.env_steps, summary.episodes) == (7, 900, 56)
+    assert summary.first_win_rate_90_env_steps == 2000
+    assert summary.first_win_rate_90_seconds == 4.0
+    assert summary.reached_90_env_steps == 4000
+    assert summary.best_greedy == 1.0
+    assert summary.last_ten_greedy == pytest.approx(4.45 / 7)
+    assert summary.last_ten_sampled == pytest.approx(4.45 / 14)
+
+
+def test_last_ten_means_ten(tmp_path: Path) -> None:
+    summary = summarise(make_run(tmp_path / "run", [0.0] * 5 + [1.0] * 10))
+    assert summary.last_ten_greedy == 1.0
+
+
+def test_a_run_without_evaluations_has_no_curve(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "run", [])
+    summary = write_report(run)
+    assert summary.reached_90_env_steps is None
+    assert summary.last_ten_greedy is None
+    assert not (run / "winrate.png").exists()
+
+
+def test_the_curve_is_a_picture(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "run", [0.0, 0.5, 1.0])
+    write_report(run)
+    assert (run / "winrate.png").read_bytes().startswith(b"\x89PNG")

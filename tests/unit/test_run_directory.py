@@ -1,0 +1,60 @@
+"""The run directory: what a resumed learner finds, also after damage."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from liir_common import config
+from liir_common.errors import ConfigError, CorruptError
+from services.learner.run_directory import Counters, RunDirectory
+from tests.samples import SPEC
+
+NOTES = {"openings": [{"batch": 3, "policy_version": 3, "epsilon": 0.5}]}
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> RunDirectory:
+    return RunDirectory(tmp_path / "run", config.load(), SPEC)
+
+
+def save(run: RunDirectory, step: int) -> None:
+    run.save_state(Counters(step, 10 * step, 2 * step), {"x": torch.full((2,), float(step))}, NOTES)
+
+
+def test_state_round_trip_and_two_are_kept(run: RunDirectory) -> None:
+    assert run.load_state() is None
+    for step in (1, 2, 3):
+        save(run, step)
+    assert len(list((run.path / "state").iterdir())) == 2
+    loaded = run.load_state()
+    assert loaded is not None
+    counters, tensors, notes = loaded
+    assert counters == Counters(3, 30, 6)
+    assert torch.equal(tensors["x"], torch.full((2,), 3.0))
+    assert notes == NOTES
+
+
+def test_a_damaged_state_falls_back_to_the_one_before(run: RunDirectory) -> None:
+    save(run, 1)
+    save(run, 2)
+    newest = run.path / "state" / "state-000000002.safetensors"
+    newest.write_bytes(newest.read_bytes()[:40])
+    loaded = run.load_state()
+    assert loaded is not None
+    assert loaded[0].learner_step == 1
+    (run.path / "state" / "state-000000001.safetensors").write_bytes(b"")
+    with pytest.raises(CorruptError, match="restore one from a backup"):
+        run.load_state()
+
+
+def test_a_run_keeps_its_id_and_its_environment(run: RunDirectory) -> None:
+    again = RunDirectory(run.path, config.load(), SPEC)
+    assert again.run_id == run.run_id
+    with pytest.raises(ConfigError, match="resume with the simulator and env section that began it"):
+        RunDirectory(run.path, config.load(), replace(SPEC, version="2"))
+
+
+def test_config_is_kept_resolved(run: RunDirectory) -> None:
+    assert config.load(run.path / "config.yaml", ["preset=none"]).algorithm == config.load().algorithm

@@ -1,0 +1,115 @@
+"""The training loop without a network: batches from a queue, checkpoints and states on disk."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from liir_common import config
+from liir_common.types import Weights
+from services.learner.algorithms import make_algorithm
+from services.learner.intake import Opening
+from services.learner.run_directory import RunDirectory
+from services.learner.trainer import Trainer
+from tests.samples import SPEC, make_trajectory
+
+BATCH = 4
+STEPS = 6
+"""Environment steps of each sample episode."""
+
+
+class Played:
+    """A trainer on `path` whose batches are played, by somebody fast, the moment they are opened."""
+
+    def __init__(self, path: Path, learner_steps: int, *settings: str) -> None:
+        resolved = config.load(
+            None,
+            [
+                f"training.batch_episodes={BATCH}",
+                f"training.total_env_steps={learner_steps * BATCH * STEPS}",
+                "learner.threads=1",
+                "algorithm.policy_hidden=8",
+                *settings,
+            ],
+        )
+        self.openings: list[Opening] = []
+        self.run = RunDirectory(path, resolved, SPEC)
+        algorithm = make_algorithm(SPEC, resolved.algorithm, 1, torch.device("cpu"))
+        self.trainer = Trainer(self.run, algorithm, self._play, lambda: None)
+
+    def _play(self, opening: Opening, weights: Weights) -> None:
+        self.openings.append(opening)
+        first = opening.batch * BATCH
+        self.trainer.batches.put(
+            [make_trajectory(first + i, opening.policy_version, STEPS) for i in range(BATCH)]
+        )
+
+    def train(self) -> Played:
+        self.trainer.run()
+        return self
+
+    def digests(self) -> dict[int, str]:
+        return {manifest.episode: manifest.sha256 for manifest in self.run.checkpoints.manifests}
+
+
+@pytest.mark.parametrize(("interval", "frozen"), [(3, [3, 6, 9, 12]), (1, list(range(1, 13))), (5, [5, 10])])
+def test_every_multiple_of_the_interval_is_frozen(tmp_path: Path, interval: int, frozen: list[int]) -> None:
+    played = Played(tmp_path, 3, f"training.checkpoint_interval={interval}").train()
+    assert list(played.digests()) == frozen
+    for manifest in played.run.checkpoints.manifests:
+        assert manifest.policy_version == -(-manifest.episode // BATCH)
+
+
+@pytest.mark.parametrize("lag", [0, 1])
+def test_batches_are_played_by_the_version_that_the_lag_says(tmp_path: Path, lag: int) -> None:
+    played = Played(tmp_path, 5, f"training.lag={lag}").train()
+    assert [opening.batch for opening in played.openings] == list(range(5 + lag))
+    assert [o.policy_version for o in played.openings] == [max(0, b - lag) for b in range(5 + lag)]
+    epsilons = [opening.epsilon for opening in played.openings]
+    assert epsilons == sorted(epsilons, reverse=True)
+    lags = [int(row["policy_lag"]) for row in played.run.metrics.read()]
+    assert lags == [min(step, lag) for step in range(5)]
+
+
+@pytest.mark.parametrize("lag", [0, 1])
+@pytest.mark.parametrize("algorithm", ["liir", "central_v"])
+@pytest.mark.parametrize("outer", ["reuse", "fresh"])
+def test_training_in_two_parts_is_training_in_one(
+    tmp_path: Path, lag: int, algorithm: str, outer: str
+) -> None:
+    settings = (
+        f"training.lag={lag}",
+        f"algorithm.name={algorithm}",
+        f"algorithm.outer_samples={outer}",
+        "training.checkpoint_interval=4",
+    )
+    whole = Played(tmp_path / "whole", 6, *settings).train()
+    Played(tmp_path / "parts", 3, *settings).train()
+    parts = Played(tmp_path / "parts", 6, *settings).train()
+    assert parts.digests() == whole.digests() != {}
+    steps = [row["learner_step"] for row in parts.run.metrics.read()]
+    assert steps == ["1", "2", "3", "4", "5", "6"]
+
+
+def test_a_crash_costs_the_steps_since_the_last_save_and_changes_nothing(tmp_path: Path) -> None:
+    settings = ("training.checkpoint_interval=4", "training.save_interval=2")
+    whole = Played(tmp_path / "whole", 6, *settings).train()
+    crashed = Played(tmp_path / "crashed", 6, *settings)
+    for opening, weights in list(crashed.trainer._openings):
+        crashed._play(opening, weights)
+    for _ in range(5):  # dies after the fifth step, without a goodbye
+        crashed.trainer._step()
+    resumed = Played(tmp_path / "crashed", 6, *settings)
+    assert resumed.trainer.next_batch == 4
+    assert len(resumed.run.metrics.read()) == 4
+    assert resumed.train().digests() == whole.digests()
+
+
+def test_stop_ends_a_trainer_that_waits(tmp_path: Path) -> None:
+    played = Played(tmp_path, 10**6)
+    played.trainer.stop()
+    played.train()
+    assert played.trainer.next_batch == 0
+    assert not played.trainer.complete

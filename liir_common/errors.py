@@ -29,6 +29,12 @@ class CorruptError(LiirError, ValueError):
     exit_code = 4
 
 
+class RefusedError(LiirError):
+    """The learner will never serve this process; to start it again would not help."""
+
+    exit_code = 5
+
+
 @contextmanager
 def exit_on_error() -> Iterator[None]:
     """Turn a `LiirError` into one line on stderr and its exit code; anything else stays a traceback."""

@@ -20,7 +20,7 @@ from rich.console import Console
 
 from liir_common.client import CheckpointClient, TrainingClient
 from liir_common.display import Display, make_display
-from liir_common.errors import ConfigError, LiirError
+from liir_common.errors import ConfigError, LiirError, RefusedError
 from liir_common.report import Summary, write_report
 from liir_common.rpc.gen.liir.v1 import checkpoint_pb2
 
@@ -29,7 +29,7 @@ log = structlog.get_logger()
 _POLL_S = 0.25
 _START_S = 120.0
 _STOP_S = 60.0
-_RESTARTS, _RESTARTS_WITHIN_S = 3, 60.0
+_RESTARTS, _RESTARTS_WITHIN_S = 3, 300.0
 _PR_SET_PDEATHSIG = 1
 
 
@@ -189,7 +189,7 @@ class Launcher:
             code = service.exit_code
             if code in (None, 0):
                 continue
-            if code in (ConfigError.exit_code,) or not service.may_restart():
+            if code in (ConfigError.exit_code, RefusedError.exit_code) or not service.may_restart():
                 self._raise_death(service)
             log.error("a process died; it is started again", service=service.name, exit_code=code)
             service.start()

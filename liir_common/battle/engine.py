@@ -1,7 +1,7 @@
 """The battle itself: compiled kernels that start a battle and play one environment step of eight loops.
 
-The rules are those of StarCraft II as far as they are public (sources and open questions: docs/battle.md);
-what SMAC v1 adds is who may do what, the reward and the end of the episode.
+The rules are those of StarCraft II as far as they are public; `parameters` names what is not. What SMAC v1
+adds is who may do what, the reward and the end of the episode.
 """
 
 import numpy as np
@@ -25,6 +25,7 @@ STEPS, TERMINATED, TRUNCATED, WON, DEAD_ALLIES, DEAD_ENEMIES = range(6)
 LOOPS_PER_STEP = 8
 NO_OP, STOP, NORTH, SOUTH, EAST, WEST = range(FIRST_ATTACK)
 IDLE, MOVE, ATTACK, ATTACK_MOVE = range(4)
+"""Only a unit that attack-moves picks targets of its own: all enemies do, no ally does."""
 ORDERS = ("idle", "move", "attack", "attack_move")
 
 MOVE_AMOUNT = 2.0
@@ -230,7 +231,7 @@ def _acquire(tables, battle, i, now, upwards):
             if rules.chase_attacker and unit.target == unit.attacker and distance2 <= CHASE_LIMIT**2:
                 return
         unit.target = -1
-    if rules.rescan_period > 1 and (np.int64(now) + i) % rules.rescan_period:
+    if np.int64(now + i) % rules.rescan_period:
         return
     if not _count_near(battle, i, rules.n_allies, rules.widest_scan2):
         return
@@ -317,12 +318,11 @@ def _hit(tables, battle, attacker, victim, now):
         target.health -= max(MINIMUM_DAMAGE, damage - absorbed - spec.armor)
     target.hurt_at = now
     target.attacker = attacker
-    is_enemy = victim >= rules.n_allies
     if target.health <= 0.0:
         target.health = target.shield = 0.0
         target.alive = False
-        battle.status[DEAD_ENEMIES if is_enemy else DEAD_ALLIES] += 1
-    elif is_enemy and target.target < 0:
+        battle.status[DEAD_ALLIES if victim < rules.n_allies else DEAD_ENEMIES] += 1
+    elif target.order == ATTACK_MOVE and target.target < 0:
         _respond(rules, battle, victim, now)
 
 
@@ -338,7 +338,8 @@ def _respond(rules, battle, victim, now):
     caller.help_at = now
     for i in range(rules.n_allies, len(battle.units)):
         friend = battle.units[i]
-        if friend.alive and friend.target < 0 and _distance2(battle, victim, i) <= HELP_RADIUS**2:
+        waits = friend.alive and friend.order == ATTACK_MOVE and friend.target < 0
+        if waits and _distance2(battle, victim, i) <= HELP_RADIUS**2:
             friend.target = friend.attacker = caller.attacker
 
 
@@ -428,10 +429,9 @@ def _separate_one(tables, battle, i, now):
 @inlined
 def _part(tables, battle, i, j, distance, contact, both_walked):
     """Unit i walked into unit j: walkers and idle friends give way half, all others stand firm."""
-    rules, overlap = tables.rules[0], contact - distance
-    if distance == 0.0:
-        return
-    x, y = (battle.x[i] - battle.x[j]) / distance, (battle.y[i] - battle.y[j]) / distance
+    rules, overlap, x, y = tables.rules[0], contact - distance, 1.0, 0.0
+    if distance > 0.0:
+        x, y = (battle.x[i] - battle.x[j]) / distance, (battle.y[i] - battle.y[j]) / distance
     is_friend = (i < rules.n_allies) == (j < rules.n_allies)
     if both_walked:
         _give_way(tables, battle, i, x, y, 0.5 * overlap)

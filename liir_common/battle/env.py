@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import secrets
-from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, TypedDict
+from collections.abc import Sequence
+from typing import Any, TypedDict
 
 import numpy as np
 from gymnasium.spaces import Box, Dict, Discrete
@@ -27,7 +27,7 @@ _STATUS_OF_INFO = {
     "dead_enemies": engine.DEAD_ENEMIES,
 }
 
-Observation = dict[str, NDArray[Any]]
+Observation = dict[str, Any]
 
 
 class UnitRecord(TypedDict):
@@ -72,14 +72,14 @@ class AvailableActions(Discrete):
         return super().sample(mask, probability)
 
 
-class BattleEnv(ParallelEnv[str, Observation, int]):  # type: ignore[misc]  # PettingZoo is untyped
+class BattleEnv(ParallelEnv[str, Observation, np.int64]):
     """Micromanagement battle with SMAC v1's rules, actions, observations and rewards.
 
     Agents stay listed until the episode ends; a dead one has the no-op as its only action, and
     `info["alive"]` says so. All agents get the team's reward.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {
+    metadata: dict[str, Any] = {  # noqa: RUF012  # PettingZoo declares it so
         "name": "battle_v1",
         "render_modes": ["ansi", "rgb_array"],
         "render_fps": 2.8,
@@ -99,8 +99,10 @@ class BattleEnv(ParallelEnv[str, Observation, int]):  # type: ignore[misc]  # Pe
         self._masks = np.zeros((n, n_actions), np.int8)
         self.possible_agents = [f"ally_{i}" for i in range(n)]
         self.agents: list[str] = []
-        self.action_spaces = {a: AvailableActions(self._masks[i]) for i, a in enumerate(self.possible_agents)}
-        self.observation_spaces = {a: self._observation_space() for a in self.possible_agents}
+        self._action_spaces = {
+            a: AvailableActions(self._masks[i]) for i, a in enumerate(self.possible_agents)
+        }
+        self._observation_spaces = {a: self._observation_space() for a in self.possible_agents}
         self.state_space = Box(-np.inf, np.inf, self._buffers.state.shape, np.float32)
 
     def _observation_space(self) -> Dict:
@@ -111,11 +113,11 @@ class BattleEnv(ParallelEnv[str, Observation, int]):  # type: ignore[misc]  # Pe
 
     def observation_space(self, agent: str) -> Dict:
         """The observation in [-1, 1] and the action mask of one agent."""
-        return self.observation_spaces[agent]
+        return self._observation_spaces[agent]
 
     def action_space(self, agent: str) -> AvailableActions:
         """SMAC v1's actions: no-op, stop, north, south, east, west, attack enemy 0, 1, ..."""
-        return self.action_spaces[agent]
+        return self._action_spaces[agent]
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
@@ -138,7 +140,7 @@ class BattleEnv(ParallelEnv[str, Observation, int]):  # type: ignore[misc]  # Pe
         return self._observations(), self._infos()
 
     def step(
-        self, actions: Mapping[str, int]
+        self, actions: dict[str, Any]
     ) -> tuple[
         dict[str, Observation], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]
     ]:
@@ -164,11 +166,11 @@ class BattleEnv(ParallelEnv[str, Observation, int]):  # type: ignore[misc]  # Pe
             self.agents = []
         return results
 
-    def _checked(self, actions: Mapping[str, int]) -> NDArray[np.int64]:
+    def _checked(self, actions: dict[str, Any]) -> NDArray[np.int64]:
         if set(actions) != set(self.agents):
             raise ValueError(f"step wants one action for each of {self.agents}, got {sorted(actions)}")
         for agent, mask in zip(self.agents, self._masks, strict=True):
-            if not (actions[agent] in self.action_spaces[agent] and mask[actions[agent]]):
+            if not (actions[agent] in self._action_spaces[agent] and mask[actions[agent]]):
                 raise ValueError(
                     f"action {actions[agent]!r} of {agent} is not available; "
                     f"its mask allows {np.flatnonzero(mask).tolist()}"
@@ -184,7 +186,9 @@ class BattleEnv(ParallelEnv[str, Observation, int]):  # type: ignore[misc]  # Pe
         return [self._record(i) for i in range(len(self._unit_types))]
 
     def restore(self, snapshot: Sequence[UnitRecord]) -> None:
-        """Put units into the recorded situation and end attacks, missiles and walks that are under way.
+        """Put units into the recorded situation.
+
+        Attacks, missiles and walks that are under way end, and shields wait as after a hit.
 
         Raises:
             ValueError: other units than the map's, or a unit where no unit can be.
@@ -247,6 +251,7 @@ class BattleEnv(ParallelEnv[str, Observation, int]):  # type: ignore[misc]  # Pe
         unit["health"], unit["shield"], unit["energy"] = record["health"], record["shield"], record["energy"]
         unit["alive"], unit["order"] = record["alive"], engine.ORDERS.index(record["order"])
         unit["ready_at"], unit["free_at"], unit["hits"] = now + record["cooldown"], now, 0
+        unit["hurt_at"] = now
         if i < n:
             unit["goal_x"], unit["goal_y"] = x, y
         target = record["target"]

@@ -3,7 +3,7 @@
 import numpy as np
 
 from liir_common.battle.engine import NO_OP, NORTH, STEPS, STOP, WEST
-from liir_common.battle.tables import FIRST_ATTACK, SHOOT_RANGE, SIGHT, inlined, kernel
+from liir_common.battle.tables import FIRST_ATTACK, SHOOT_RANGE, SIGHT, SURROUNDINGS, inlined, kernel
 
 MAP_SIZE = 32.0
 _CENTRE = MAP_SIZE / 2.0
@@ -11,6 +11,7 @@ _CENTRE = MAP_SIZE / 2.0
 _PER_SIGHT = 1.0 / SIGHT
 SIGHT2, SHOOT_RANGE2 = SIGHT**2, SHOOT_RANGE**2
 _MOVES = WEST - STOP
+_SURROUNDINGS = np.array(SURROUNDINGS)
 
 
 @kernel
@@ -21,31 +22,45 @@ def observe(tables, battle, obs, state, mask, alive):
     for i in range(tables.rules[0].n_allies):
         alive[i] = battle.units[i].alive
         if alive[i]:
-            _write_moves(tables, battle, i, obs[i], mask[i])
-            at = _write_enemies(tables, battle, i, obs[i], mask[i], _MOVES)
+            at = _write_moves(tables, battle, i, obs[i], mask[i])
+            at = _write_enemies(tables, battle, i, obs[i], mask[i], at)
             at = _write_allies(tables, battle, i, obs[i], at)
             _write_self(tables, battle, i, obs[i], at)
         else:
             mask[i, NO_OP] = True
         if tables.rules[0].obs_timestep_number:
             obs[i, -1] = battle.status[STEPS] / tables.rules[0].limit
-    _write_state(tables, battle, state)
+    if tables.rules[0].obs_instead_of_state:
+        for i in range(len(obs)):
+            for k in range(obs.shape[1]):
+                state[i * obs.shape[1] + k] = obs[i, k]
+    else:
+        _write_state(tables, battle, state)
 
 
 @inlined
 def _write_moves(tables, battle, i, obs, mask):
-    """A unit may move where the ground is open one cell ahead; the observation starts with that."""
+    """A unit may move where the ground is open one cell ahead; the observation starts with that.
+
+    Returns where the next features go.
+    """
     mask[STOP] = True
-    for k in range(4):
-        x = battle.x[i] + (k == 2) - (k == 3)
-        y = battle.y[i] + (k == 0) - (k == 1)
-        mask[NORTH + k] = obs[k] = _can_stand(tables.pathing, x, y)
+    for k in range(_MOVES):
+        x, y = battle.x[i] + (k == 2) - (k == 3), battle.y[i] + (k == 0) - (k == 1)
+        mask[NORTH + k] = obs[k] = _is_open(tables.pathing, int(x), int(y), False)
+    if not tables.rules[0].obs_pathing_grid:
+        return _MOVES
+    for k in range(len(_SURROUNDINGS)):
+        x, y = int(battle.x[i]) + _SURROUNDINGS[k, 0], int(battle.y[i]) + _SURROUNDINGS[k, 1]
+        obs[_MOVES + k] = _is_open(tables.pathing, x, y, True)
+    return _MOVES + len(_SURROUNDINGS)
 
 
 @inlined
-def _can_stand(pathing, x, y):
-    cell_x, cell_y = int(x), int(y)
-    return 0 <= cell_x < pathing.shape[0] and 0 <= cell_y < pathing.shape[1] and pathing[cell_x, cell_y]
+def _is_open(pathing, x, y, outside):
+    if 0 <= x < pathing.shape[0] and 0 <= y < pathing.shape[1]:
+        return pathing[x, y]
+    return outside
 
 
 @inlined

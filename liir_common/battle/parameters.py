@@ -23,7 +23,11 @@ class Options:
     """Observations have the life and shield of visible units; implies `obs_own_health`."""
     obs_own_health: bool = True
     obs_last_action: bool = False
+    obs_pathing_grid: bool = False
+    """Observations say whether the ground is open at eight points around the unit."""
     obs_timestep_number: bool = False
+    obs_instead_of_state: bool = False
+    """The state is all observations in a row."""
     state_last_action: bool = True
     state_timestep_number: bool = False
     reward_only_positive: bool = True
@@ -42,7 +46,8 @@ class Options:
 
 @dataclass(frozen=True)
 class Parameters:
-    """What no source settles about the game; the defaults explain the published figures best together."""
+    """What no source settles about the game; the defaults together fit the
+    published figures best (`calibrate`)."""
 
     head_start: int = _at_least(2, 0)
     """Loops that the enemies walk before the first observation."""
@@ -52,7 +57,7 @@ class Parameters:
     """Units stand on a square grid around their point instead of in hexagonal rings."""
     separation_collision: bool = False
     """Discs collide with the separation radius instead of the radius."""
-    slide: float = field(default=1.0, metadata={"minimum": 0, "maximum": 1})
+    slide: float = field(default=0.9, metadata={"minimum": 0, "maximum": 1})
     """Share of the blocked motion that goes sideways around the blocker."""
     push_idle: bool = True
     """Walking units push idle units of their team aside."""
@@ -66,8 +71,8 @@ class Parameters:
     """An attack that is interrupted before its first hit costs no cooldown."""
     integer_delay: bool = False
     """The random delay between attacks is a whole number of loops."""
-    rescan_period: int = _at_least(1, 1)
-    """Loops between two looks for a target."""
+    rescan_period: int = _at_least(6, 1)
+    """Loops between two looks for a target, for a unit that has none."""
     drop_beyond_reach: bool = False
     """Enemies drop a target that is beyond their weapon instead of one beyond their scan range."""
     scan_adds_radii: bool = True

@@ -32,6 +32,8 @@ FIRST_ATTACK = 6
 """Actions below: no-op, stop, north, south, east, west."""
 SIGHT, SHOOT_RANGE = 9.0, 6.0
 """SMAC v1's ranges, from centre to centre and for all unit types."""
+SURROUNDINGS = ((0, 4), (0, -4), (4, 0), (-4, 0), (2, 2), (-2, -2), (2, -2), (-2, 2))
+"""Where SMAC v1 probes the ground around a unit."""
 
 _SCALAR = {bool: np.bool_, int: np.int64, float: np.float64}
 
@@ -269,14 +271,14 @@ def _sizes(rules: Any) -> tuple[int, int]:
     enemy = int(rules["enemy_bits"])
     ally_health, enemy_health = 1 + int(rules["ally_shields"]), 1 + int(rules["enemy_shields"])
     seen = int(rules["obs_all_health"])
-    obs = 4 + m * (4 + seen * enemy_health + enemy)
+    obs = 4 + int(rules["obs_pathing_grid"]) * len(SURROUNDINGS) + m * (4 + seen * enemy_health + enemy)
     obs += (n - 1) * (4 + seen * ally_health + ally + int(rules["obs_last_action"]) * actions)
     obs += int(rules["obs_own_health"]) * ally_health + ally
     # SMAC v1 leaves one more place in the own features than it fills, and then appends the step number.
     obs += 2 * int(rules["obs_timestep_number"])
     state = n * (3 + ally_health + ally) + m * (2 + enemy_health + enemy)
     state += int(rules["state_last_action"]) * n * actions + int(rules["state_timestep_number"])
-    return obs, state
+    return obs, n * obs if rules["obs_instead_of_state"] else state
 
 
 def _reward_divisor(settings: Settings, enemies: Sequence[UnitType]) -> float:

@@ -12,13 +12,13 @@ import structlog
 
 from liir_common import metrics
 from liir_common.config import ActorsConfig, Config
-from liir_common.errors import LiirError
+from liir_common.errors import LiirError, RefusedError
 from liir_common.rpc.channel import backoffs
 from services.actor.rollout_actor import RolloutActor
 
 log = structlog.get_logger()
 
-_POLL_S = 1.0
+_POLL_S, _POLL_WHILE_STARTING_S = 1.0, 0.1
 _QUICK_DEATH_S = 10.0
 """An actor that dies sooner is started again more and more slowly."""
 
@@ -31,7 +31,11 @@ class _Member:
     incarnation: int = -1
     started: float = 0.0
     start_at: float = 0.0
-    run: ray.ObjectRef | None = None
+    """When it is due to start, on the monotonic clock."""
+    ready: Any = None
+    """Reference that resolves when the actor is there; None once it did."""
+    run: Any = None
+    """Reference that resolves when the actor ends; None while there is none."""
 
 
 class Fleet:
@@ -40,50 +44,58 @@ class Fleet:
     def __init__(self, address: str, config: Config) -> None:
         """Play for the learner at `address`; Ray must be initialised."""
         self._address = address
-        self._config = config
+        self._tree = config.tree()
         # An actor waits more than it computes and does not say how many cores it needs: no CPU is
         # reserved, so that any number of actors fits, spread evenly over the nodes.
         self._actor_class: Any = ray.remote(num_cpus=0, scheduling_strategy="SPREAD")(RolloutActor)
         self._members = [_Member(f"actor-{i:03d}") for i in range(config.actors.count)]
         self._waits = {member.name: backoffs() for member in self._members}
+        # Starting is work for a core: one at a time on each, so that the first play while others start.
+        self._starting_at_once = max(1, int(ray.cluster_resources().get("CPU", 1)))
 
     def run(self) -> None:
         """Return when every actor was told that the run is complete.
 
         Raises:
-            LiirError: the learner refused an actor.
+            RefusedError: the learner will not have an actor.
+            ray.exceptions.RayTaskError: an actor failed; its traceback is part of the message.
         """
-        for member in self._members:
-            self._start(member)
         while self._members:
+            starting = self._start_due()
             metrics.ACTORS_ALIVE.set(sum(member.run is not None for member in self._members))
-            self._restart_due()
-            self._collect_ended()
+            self._collect_ended(_POLL_WHILE_STARTING_S if starting else _POLL_S)
+
+    def _start_due(self) -> bool:
+        """Start those whose time has come, as many as may; true if some are on the way."""
+        starting = [member for member in self._members if member.ready is not None]
+        for member in starting:
+            if ray.wait([member.ready], timeout=0)[0]:
+                member.ready = None
+        now = time.monotonic()
+        due = [member for member in self._members if member.run is None and member.start_at <= now]
+        room = self._starting_at_once - sum(member.ready is not None for member in starting)
+        for member in due[: max(0, room)]:
+            self._start(member)
+        return bool(due) or any(member.ready is not None for member in starting)
 
     def _start(self, member: _Member) -> None:
         member.incarnation += 1
         member.started = time.monotonic()
-        actor = self._actor_class.remote(member.name, member.incarnation, self._address, self._config.tree())
-        member.run = actor.run.remote()
+        actor = self._actor_class.remote(member.name, member.incarnation, self._address, self._tree)
+        member.ready, member.run = actor.ready.remote(), actor.run.remote()
 
-    def _restart_due(self) -> None:
-        now = time.monotonic()
-        for member in self._members:
-            if member.run is None and member.start_at <= now:
-                self._start(member)
-
-    def _collect_ended(self) -> None:
+    def _collect_ended(self, timeout_s: float) -> None:
         running = {member.run: member for member in self._members if member.run is not None}
         if not running:
-            time.sleep(_POLL_S / 10)
+            time.sleep(timeout_s)
             return
-        ended, _ = ray.wait(list(running), timeout=_POLL_S)
+        ended, _ = ray.wait(list(running), timeout=timeout_s)
         for reference in ended:
             member = running[reference]
             try:
                 ray.get(reference)
-            except ray.exceptions.RayTaskError as error:
-                raise LiirError(f"{member.name} cannot play: {error.cause}") from error
+            except RefusedError as error:
+                raise RefusedError(f"{member.name}: {error}") from None
             except ray.exceptions.RayActorError as error:
                 self._died(member, error)
             else:
@@ -98,7 +110,8 @@ class Fleet:
             "an actor died; it is started again", actor=member.name, wait_s=round(wait, 2), error=str(error)
         )
         metrics.ACTOR_RESTARTS.inc()
-        member.run, member.start_at = None, now + wait
+        member.ready = member.run = None
+        member.start_at = now + wait
 
 
 def start_ray(config: ActorsConfig) -> None:

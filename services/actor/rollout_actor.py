@@ -11,6 +11,7 @@ import structlog
 from liir_common import logs, types
 from liir_common.build import build
 from liir_common.config import Config, from_tree
+from liir_common.errors import RefusedError
 from liir_common.rollout.play import make_player
 from liir_common.rollout.player import Player
 from liir_common.rpc import channel, codec
@@ -36,11 +37,14 @@ class RolloutActor:
         self._player: Player = make_player(config.env, config.algorithm.policy_hidden)
         self._shapes = types.policy_shapes(self._player.spec, config.algorithm.policy_hidden)
 
+    def ready(self) -> None:
+        """Answers once the actor is there."""
+
     def run(self) -> None:
         """Play until the learner says that the run is complete.
 
         Raises:
-            grpc.RpcError: the learner refused this actor; to try again would not help.
+            RefusedError: the learner will not have this actor.
         """
         waits = channel.backoffs()
         while True:
@@ -51,7 +55,7 @@ class RolloutActor:
                 waits = channel.backoffs()
             except grpc.RpcError as error:
                 if error.code() not in _RETRIED:
-                    raise
+                    raise RefusedError(f"{error.code().name}: {error.details()}") from None
                 log.warning("the learner is away", address=self._address, reason=error.details())
             # Nothing to keep: whoever gets the tickets next plays the same episodes.
             time.sleep(next(waits))

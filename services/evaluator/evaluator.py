@@ -11,6 +11,7 @@ import structlog
 from liir_common import checkpoint, metrics, seeds
 from liir_common.client import CheckpointClient
 from liir_common.config import Config
+from liir_common.errors import RefusedError
 from liir_common.rollout.player import Player
 from liir_common.rpc.channel import backoffs
 from liir_common.rpc.gen.liir.v1 import checkpoint_pb2
@@ -57,7 +58,7 @@ class Evaluator:
         """Return when the run is complete and every checkpoint has its test.
 
         Raises:
-            grpc.RpcError: the learner refused a call; to try again would not help.
+            RefusedError: the learner refused a call; to try again would not help.
         """
         waits = backoffs()
         while True:
@@ -67,7 +68,7 @@ class Evaluator:
                     return
             except grpc.RpcError as error:
                 if error.code() != grpc.StatusCode.UNAVAILABLE:
-                    raise
+                    raise RefusedError(f"{error.code().name}: {error.details()}") from None
                 log.warning("the learner is away", address=self._address, reason=error.details())
             time.sleep(next(waits))
 

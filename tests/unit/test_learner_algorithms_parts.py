@@ -1,4 +1,4 @@
-"""The pieces of the learning rules: returns, the GRU's derivatives, optimisers, networks, intake of a batch."""
+"""The pieces of the learning rules: returns, the GRU's derivatives, optimisers, networks, batch rows."""
 
 from __future__ import annotations
 

@@ -122,7 +122,7 @@ def prepare(
         log_mu=floats(batch.log_mu[b, t, i]),
         weight=floats(alive),
         count=float(alive.sum()),
-        reward=floats(batch.reward[..., None]),
+        reward=floats(np.where(batch.filled, batch.reward, 0)[..., None]),
         filled=floats(batch.filled),
         state=floats(batch.state.reshape(-1, spec.state_dim)[steps]),
         steps=as_is(steps),

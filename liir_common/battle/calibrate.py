@@ -1,0 +1,129 @@
+"""Compare the simulator with what is published about SMAC v1 on StarCraft II.
+
+The targets are means over training logs of the real game: first episodes of uniformly random teams, and
+test episodes of greedy untrained networks that never attack.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liir_common.battle.policies import CLOSEST_ENEMY, RANDOM, STAND, STEP_ASIDE, play
+from liir_common.battle.scenarios import make_battle
+
+_LENGTH, _RETURN, _WON, _DEAD_ALLIES = range(4)
+_POLICIES: Mapping[str, int] = {
+    "random": RANDOM,
+    "stand": STAND,
+    "step aside": STEP_ASIDE,
+    "closest enemy": CLOSEST_ENEMY,
+}
+
+
+@dataclass(frozen=True)
+class Target:
+    """A figure of the real game."""
+
+    policy: str
+    figure: str
+    value: float
+
+
+TARGETS: Mapping[str, tuple[Target, ...]] = {
+    "3m": (
+        Target("random", "mean length", 27.6),
+        Target("random", "median length", 26),
+        Target("random", "mean return", 1.53),
+        Target("random", "win rate", 0),
+        Target("stand", "mean length", 21.7),
+        Target("step aside", "dead allies", 0),
+    ),
+    "8m": (
+        Target("random", "mean length", 35.3),
+        Target("random", "median length", 30),
+        Target("random", "mean return", 1.92),
+        Target("random", "win rate", 0),
+        Target("stand", "mean length", 24.0),
+        Target("step aside", "dead allies", 0),
+    ),
+    "2s3z": (
+        Target("random", "mean length", 52.6),
+        Target("random", "median length", 50),
+        Target("random", "mean return", 3.88),
+        Target("random", "win rate", 0),
+        Target("stand", "mean length", 43.1),
+        Target("closest enemy", "win rate", 0.9),
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Row:
+    """A figure of the real game beside the simulator's."""
+
+    target: Target
+    measured: float
+
+    @property
+    def difference(self) -> float:
+        """Relative to the target; absolute where the target is 0."""
+        return (self.measured - self.target.value) / (self.target.value or 1.0)
+
+
+def calibrate(map_name: str, episodes: int = 2000, seed: int = 0, **options: Any) -> list[Row]:
+    """Play the scripted policies on a map that has targets and compare.
+
+    Raises:
+        ValueError: an unknown map, one without targets, or an illegal option.
+    """
+    tables, _ = make_battle(map_name, **options)
+    if map_name not in TARGETS:
+        raise ValueError(
+            f"nothing is published about {map_name!r} to compare with; known: {', '.join(TARGETS)}"
+        )
+    targets = TARGETS[map_name]
+    outcomes = {name: play(tables, _POLICIES[name], episodes, seed) for name in {t.policy for t in targets}}
+    return [Row(target, _figure(outcomes[target.policy], target.figure)) for target in targets]
+
+
+def _figure(outcomes: NDArray[np.float64], figure: str) -> float:
+    values = {
+        "mean length": outcomes[:, _LENGTH].mean(),
+        "median length": np.median(outcomes[:, _LENGTH]),
+        "mean return": outcomes[:, _RETURN].mean(),
+        "win rate": outcomes[:, _WON].mean(),
+        "dead allies": outcomes[:, _DEAD_ALLIES].mean(),
+    }
+    return float(values[figure])
+
+
+def format_rows(map_name: str, rows: list[Row]) -> str:
+    """A table for people."""
+    lines = [f"{map_name:<8}{'policy':<15}{'figure':<15}{'real':>8}{'here':>9}{'diff':>9}"]
+    for row in rows:
+        target = row.target
+        lines.append(
+            f"{'':<8}{target.policy:<15}{target.figure:<15}"
+            f"{target.value:8.2f}{row.measured:9.2f}{row.difference:9.1%}"
+        )
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Command line: print the tables of the maps named, or of all that have targets."""
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument("maps", nargs="*", default=list(TARGETS))
+    parser.add_argument("--episodes", type=int, default=2000)
+    arguments = parser.parse_args()
+    for name in arguments.maps:
+        print(format_rows(name, calibrate(name, arguments.episodes)))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,68 @@
+"""What holds in every battle, whatever is played."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from liir_common.battle.engine import STEPS
+from liir_common.battle.env import BattleEnv, parallel_env
+
+MAPS = ("3m", "8m", "2s3z", "3s_vs_5z", "10m_vs_11m")
+ENVS = {name: parallel_env(name, reward_scale=False, reward_win=0.0) for name in MAPS}
+
+
+def check_units(env: BattleEnv) -> None:
+    pathing = env._tables.pathing
+    for unit in env.snapshot():
+        assert 0 <= unit["health"] <= unit["health_max"]
+        assert 0 <= unit["shield"] <= unit["shield_max"]
+        assert unit["alive"] == (unit["health"] > 0)
+        assert pathing[int(unit["x"]), int(unit["y"])]
+        assert np.isfinite([unit["x"], unit["y"], unit["cooldown"]]).all()
+
+
+def vitality(env: BattleEnv, team: str) -> float:
+    return sum(u["health"] + u["shield"] for u in env.snapshot() if u["team"] == team)
+
+
+@pytest.mark.parametrize("map_name", MAPS)
+@settings(max_examples=8, deadline=None)
+@given(seed=st.integers(0, 2**64 - 1), bold=st.booleans())
+def test_invariants(map_name: str, seed: int, bold: bool) -> None:
+    env, rng = ENVS[map_name], np.random.default_rng(seed)
+    observations, _ = env.reset(seed=seed)
+    total, limit = 0.0, int(env._tables.rules["limit"][0])
+    started_with = vitality(env, "enemy")
+    for _ in range(limit):
+        dead = {(u["team"], u["id"]): (u["x"], u["y"]) for u in env.snapshot() if not u["alive"]}
+        actions = {}
+        for agent in env.agents:
+            available = np.flatnonzero(observations[agent]["action_mask"])
+            actions[agent] = int(available[-1] if bold else rng.choice(available))
+        observations, rewards, terminated, truncated, infos = env.step(actions)
+        total += rewards["ally_0"]
+        check_units(env)
+        for unit in env.snapshot():
+            key = (unit["team"], unit["id"])
+            if key in dead:
+                assert not unit["alive"], "the dead stay dead"
+                assert (unit["x"], unit["y"]) == dead[key], "and do not move"
+        for agent, observation in observations.items():
+            assert np.isfinite(observation["observation"]).all()
+            assert np.abs(observation["observation"]).max() <= 1
+            assert observation["action_mask"].any()
+            assert observation["action_mask"][0] == (not infos[agent]["alive"])
+        assert np.isfinite(env.state()).all()
+        if not env.agents:
+            break
+    assert not env.agents, "an episode ends at the limit at the latest"
+    assert any(terminated.values()) != any(truncated.values())
+    assert any(terminated.values()) or env._battle.status[STEPS] == limit
+    if "z" not in map_name:
+        dead_enemies = infos["ally_0"]["dead_enemies"]
+        assert total == pytest.approx(started_with - vitality(env, "enemy") + 10 * dead_enemies), (
+            "without regeneration the return is the damage done and the kills"
+        )

@@ -1,0 +1,204 @@
+"""The PettingZoo side of the battle."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from pettingzoo.test import parallel_api_test, parallel_seed_test
+
+from liir_common.battle.bench import bench_sim
+from liir_common.battle.calibrate import calibrate
+from liir_common.battle.engine import SIMULATOR_VERSION
+from liir_common.battle.env import BattleEnv, battle_spec, parallel_env
+from liir_common.battle.scenarios import SCENARIOS, make_battle
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("map_name", SCENARIOS)
+def test_pettingzoo_api(map_name: str) -> None:
+    parallel_api_test(parallel_env(map_name), num_cycles=100)
+    parallel_seed_test(lambda: parallel_env(map_name))
+
+
+def play_randomly(env: BattleEnv, seed: int) -> tuple[list[Any], dict[str, dict[str, Any]]]:
+    """Everything that an episode of random actions shows, as bytes, and its last infos."""
+    observations, infos = env.reset(seed=seed)
+    seen: list[Any] = []
+    for i, agent in enumerate(env.agents):
+        env.action_space(agent).seed(seed + i)
+    while env.agents:
+        actions = {agent: env.action_space(agent).sample() for agent in env.agents}
+        observations, rewards, terminated, truncated, infos = env.step(actions)
+        for part in observations.values():
+            seen += [part["observation"].tobytes(), part["action_mask"].tobytes()]
+        seen += [env.state().tobytes(), rewards, terminated, truncated, infos, tuple(actions.values())]
+    return seen, infos
+
+
+@pytest.mark.parametrize("map_name", ["3m", "8m", "2s3z"])
+def test_same_seed_and_actions_same_bytes(map_name: str) -> None:
+    env = parallel_env(map_name)
+    first = play_randomly(env, 7)[0]
+    play_randomly(env, 8)
+    assert play_randomly(env, 7)[0] == first, "an episode depends on the one before"
+    assert play_randomly(parallel_env(map_name), 7)[0] == first
+    assert play_randomly(env, 8)[0] != first
+
+
+def test_seeds_have_64_bits() -> None:
+    env = parallel_env("3m")
+    assert play_randomly(env, 2**33 - 1)[0] != play_randomly(env, 2**32 - 1)[0]
+    env.reset(seed=2**64 - 1)
+    for seed in (-1, 2**64):
+        with pytest.raises(ValueError, match="in \\[0, 2\\*\\*64\\)"):
+            env.reset(seed=seed)
+
+
+def test_a_reset_without_a_seed_is_fresh() -> None:
+    env = parallel_env("3m")
+    streams = set()
+    for _ in range(4):
+        env.reset()
+        streams.add(int(env._battle.stream[0]))
+    assert len(streams) == 4
+
+
+def test_the_last_step_tells_the_outcome() -> None:
+    infos = play_randomly(parallel_env("3m"), 1)[1]
+    for info in infos.values():
+        assert set(info) == {"alive", *battle_spec("3m").info_keys}
+        assert all(isinstance(info[key], float) for key in battle_spec("3m").info_keys)
+
+
+def test_the_dead_stay_listed_with_the_no_op() -> None:
+    env = parallel_env("3m")
+    observations, infos = env.reset(seed=1)
+    seen_dead = False
+    while env.agents:
+        observations, _, _, _, infos = env.step({a: env.action_space(a).sample() for a in env.agents})
+        assert set(infos) == set(env.possible_agents)
+        for agent, info in infos.items():
+            mask = observations[agent]["action_mask"]
+            assert mask.any()
+            if not info["alive"]:
+                seen_dead = True
+                assert np.flatnonzero(mask).tolist() == [0]
+                assert not observations[agent]["observation"].any()
+    assert seen_dead
+
+
+def test_unavailable_actions_are_refused() -> None:
+    env = parallel_env("3m")
+    env.reset(seed=1)
+    with pytest.raises(
+        ValueError, match=r"action 7 of ally_1 is not available; its mask allows \[1, 2, 3, 4, 5\]"
+    ):
+        env.step({"ally_0": 1, "ally_1": 7, "ally_2": 1})
+    with pytest.raises(ValueError, match="action 9 of ally_2"):
+        env.step({"ally_0": 1, "ally_1": 1, "ally_2": 9})
+    with pytest.raises(ValueError, match="one action for each"):
+        env.step({"ally_0": 1})
+    env.step(dict.fromkeys(env.agents, 1))
+
+
+def test_no_step_after_the_end() -> None:
+    env = parallel_env("3m")
+    with pytest.raises(RuntimeError, match="call reset"):
+        env.step({})
+    play_randomly(env, 1)
+    with pytest.raises(RuntimeError, match="call reset"):
+        env.step({})
+
+
+@pytest.mark.parametrize(
+    ("map_name", "options", "message"),
+    [
+        ("4m", {}, "unknown map '4m'; known: 3m, 8m"),
+        ("3m", {"rewardscale": True}, "unknown battle options .*known: .*reward_scale"),
+        ("3m", {"reward_scale": 1}, "reward_scale wants bool, got 1"),
+        ("3m", {"reward_win": "big"}, "reward_win wants float, got 'big'"),
+        ("3m", {"reward_win": float("nan")}, "reward_win wants a value in"),
+        ("3m", {"reward_scale_rate": 0}, "reward_scale_rate wants a value in"),
+        ("3m", {"order_latency": 8}, r"order_latency wants a value in \[0, 7\], got 8"),
+    ],
+)
+@pytest.mark.parametrize("make", [parallel_env, battle_spec, make_battle])
+def test_bad_input(make: Any, map_name: str, options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make(map_name, **options)
+
+
+def test_spec_hash_follows_every_option() -> None:
+    plain = battle_spec("3m")
+    assert plain.name == "battle/3m"
+    assert plain.version == SIMULATOR_VERSION
+    assert plain.hash == battle_spec("3m", reward_win=200).hash, "a default that is written out"
+    assert plain.hash != battle_spec("3m", slide=0.5).hash
+    assert json.loads(plain.options)["rescan_period"] == 6
+
+
+def test_snapshot_and_restore() -> None:
+    env, copy = parallel_env("2s3z"), parallel_env("2s3z")
+    env.reset(seed=3)
+    copy.reset(seed=4)
+    for _ in range(14):
+        env.step({a: env.action_space(a).sample() for a in env.agents})
+    copy.restore(env.snapshot())
+    assert copy.snapshot() == env.snapshot()
+    for agent in env.agents:
+        for key, value in env._observations()[agent].items():
+            assert np.array_equal(value, copy._observations()[agent][key])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"x": 40.0}, "wants a place that units can reach"),
+        ({"x": 5.0, "y": 3.0}, "wants a place that units can reach"),
+        ({"health": 46.0}, "wants health in"),
+        ({"health": 0.0}, "alive wants to mean"),
+        ({"order": "dance"}, "order wants one of"),
+        ({"unit_type": "zealot"}, "this map wants the units"),
+    ],
+)
+def test_restore_refuses_what_cannot_be(change: dict[str, Any], message: str) -> None:
+    env = parallel_env("3m")
+    env.reset(seed=1)
+    records = env.snapshot()
+    records[1].update(change)  # type: ignore[typeddict-item]
+    with pytest.raises(ValueError, match=message):
+        env.restore(records)
+
+
+def test_render() -> None:
+    env = parallel_env("2s3z", render_mode="ansi")
+    env.reset(seed=1)
+    text = env.render()
+    assert isinstance(text, str)
+    field = text.splitlines()[:32]
+    assert "s" in field[15], "an allied stalker stands on the first point"
+    assert {"z", "S", "Z"} <= set("".join(field))
+    env = parallel_env("2s3z", render_mode="rgb_array")
+    env.reset(seed=1)
+    image = env.render()
+    assert isinstance(image, np.ndarray)
+    assert image.shape == (512, 512, 3)
+    assert tuple(image[256, 9 * 16]) == (86, 156, 214)
+    assert tuple(image[256, int(env.snapshot()[5]["x"] * 16)]) == (209, 84, 78)
+    assert parallel_env("3m").render() is None
+    with pytest.raises(ValueError, match="render_mode wants one of"):
+        parallel_env("3m", render_mode="human")
+
+
+def test_bench_and_calibration_measure() -> None:
+    assert bench_sim("3m", episodes=200, repeats=2)["env_steps_per_s"] > 50_000
+    rows = {(r.target.policy, r.target.figure): r for r in calibrate("3m", episodes=1000)}
+    assert abs(rows["random", "mean length"].difference) < 0.05
+    assert abs(rows["random", "mean return"].difference) < 0.10
+    assert abs(rows["stand", "mean length"].difference) < 0.03
+    assert rows["step aside", "dead allies"].measured == 0
+    with pytest.raises(ValueError, match="nothing is published"):
+        calibrate("25m")

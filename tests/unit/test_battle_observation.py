@@ -1,0 +1,201 @@
+"""Observations, state and masks against a slow reference written from the layout of SMAC v1."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from liir_common.battle.env import BattleEnv, UnitRecord, battle_spec, parallel_env
+from liir_common.battle.scenarios import SCENARIOS, TERRAINS
+
+SIGHT, SHOOT_RANGE = 9.0, 6.0
+COOLDOWN_MAX = {"marine": 15, "stalker": 35, "zealot": 22}
+ALLY_BITS = {"stalker": 0, "zealot": 1}
+ENEMY_BITS = {"zealot": 0, "stalker": 1}
+DEFAULTS: dict[str, Any] = {
+    "obs_all_health": True,
+    "obs_own_health": True,
+    "obs_last_action": False,
+    "obs_pathing_grid": False,
+    "obs_timestep_number": False,
+    "obs_instead_of_state": False,
+    "state_last_action": True,
+    "state_timestep_number": False,
+}
+OPTIONS: tuple[dict[str, Any], ...] = (
+    {},
+    {"state_last_action": False, "state_timestep_number": True},
+    {"obs_last_action": True, "obs_timestep_number": True, "obs_pathing_grid": True},
+    {"obs_all_health": False},
+    {"obs_all_health": False, "obs_own_health": False, "obs_instead_of_state": True},
+)
+MAPS = ("3m", "5m_vs_6m", "8m", "2s3z", "3s5z", "3s_vs_4z")
+
+
+class Reference:
+    """The layout, value by value."""
+
+    def __init__(self, map_name: str, options: dict[str, Any]) -> None:
+        self.scenario = SCENARIOS[map_name]
+        self.options = DEFAULTS | options
+        self.options["obs_own_health"] |= self.options["obs_all_health"]
+        self.pathing = TERRAINS[self.scenario.terrain]
+        self.mixed = "z" in map_name and "vs" not in map_name
+
+    def is_open(self, x: int, y: int, outside: bool) -> bool:
+        inside = 0 <= x < 32 and 0 <= y < 32
+        return bool(self.pathing[x, y]) if inside else outside
+
+    def mask(self, me: UnitRecord, enemies: list[UnitRecord]) -> list[bool]:
+        if not me["alive"]:
+            return [True] + [False] * (5 + len(enemies))
+        x, y = me["x"], me["y"]
+        moves = [
+            self.is_open(int(x), int(y + 1), False),
+            self.is_open(int(x), int(y - 1), False),
+            self.is_open(int(x + 1), int(y), False),
+            self.is_open(int(x - 1), int(y), False),
+        ]
+        attacks = [e["alive"] and np.hypot(e["x"] - x, e["y"] - y) <= SHOOT_RANGE for e in enemies]
+        return [False, True, *moves, *attacks]
+
+    def health(self, unit: UnitRecord, shields: bool) -> list[float]:
+        values = [unit["health"] / unit["health_max"]]
+        return [*values, unit["shield"] / unit["shield_max"]] if shields else values
+
+    def type_bits(self, unit: UnitRecord) -> list[float]:
+        if not self.mixed:
+            return []
+        bits = [0.0, 0.0]
+        bits[(ALLY_BITS if unit["team"] == "ally" else ENEMY_BITS)[unit["unit_type"]]] = 1.0
+        return bits
+
+    def seen(self, me: UnitRecord, other: UnitRecord, first: float, tail: list[float]) -> list[float]:
+        dx, dy = other["x"] - me["x"], other["y"] - me["y"]
+        distance = np.hypot(dx, dy)
+        shields = other["shield_max"] > 0
+        health = self.health(other, shields) if self.options["obs_all_health"] else []
+        values = [first, distance / SIGHT, dx / SIGHT, dy / SIGHT, *health, *self.type_bits(other), *tail]
+        visible = me["alive"] and other["alive"] and distance < SIGHT
+        return values if visible else [0.0] * len(values)
+
+    def observation(
+        self, units: list[UnitRecord], i: int, last_actions: np.ndarray[Any, Any], share: float
+    ) -> list[float]:
+        allies = [u for u in units if u["team"] == "ally"]
+        enemies = [u for u in units if u["team"] == "enemy"]
+        me = allies[i]
+        mask = self.mask(me, enemies)
+        values = [float(v) for v in mask[2:6]]
+        if self.options["obs_pathing_grid"]:
+            x, y = int(me["x"]), int(me["y"])
+            around = [(0, 4), (0, -4), (4, 0), (-4, 0), (2, 2), (-2, -2), (2, -2), (-2, 2)]
+            values += [float(self.is_open(x + dx, y + dy, True)) for dx, dy in around]
+        for j, enemy in enumerate(enemies):
+            values += self.seen(me, enemy, float(mask[6 + j]), [])
+        for j, ally in enumerate(allies):
+            if j != i:
+                tail = list(last_actions[j]) if self.options["obs_last_action"] else []
+                values += self.seen(me, ally, 1.0, tail)
+        if self.options["obs_own_health"]:
+            values += self.health(me, me["shield_max"] > 0)
+        values += self.type_bits(me)
+        if not me["alive"]:
+            values = [0.0] * len(values)
+        return [*values, 0.0, share] if self.options["obs_timestep_number"] else values
+
+    def state(self, units: list[UnitRecord], last_actions: np.ndarray[Any, Any], share: float) -> list[float]:
+        values: list[float] = []
+        for unit in units:
+            row = [unit["health"] / unit["health_max"]]
+            if unit["team"] == "ally":
+                row.append(unit["cooldown"] / COOLDOWN_MAX[unit["unit_type"]])
+            row += [(unit["x"] - 16) / 32, (unit["y"] - 16) / 32]
+            if unit["shield_max"]:
+                row.append(unit["shield"] / unit["shield_max"])
+            row += self.type_bits(unit)
+            values += row if unit["alive"] else [0.0] * len(row)
+        if self.options["state_last_action"]:
+            values += list(last_actions.ravel())
+        return [*values, share] if self.options["state_timestep_number"] else values
+
+
+def scatter(env: BattleEnv, rng: np.random.Generator) -> None:
+    """Put all units somewhere, near enough to each other that many are in sight."""
+    records = env.snapshot()
+    pathing = env._tables.pathing
+    for record in records:
+        while not pathing[int(record["x"]), int(record["y"])] or rng.random() < 0.5:
+            record["x"], record["y"] = rng.uniform(2, 18), rng.uniform(4, 26)
+        alive = bool(rng.random() < 0.8)
+        record["alive"] = alive
+        record["health"] = float(rng.integers(1, int(record["health_max"]))) if alive else 0.0
+        record["shield"] = float(rng.uniform(0, record["shield_max"])) if alive else 0.0
+        record["cooldown"] = float(rng.choice([0.0, rng.uniform(0, 40)]))
+    for team in (records[0], records[-1]):
+        team["alive"], team["health"] = True, 7.0
+    env.restore(records)
+
+
+@pytest.mark.parametrize("options", OPTIONS, ids=lambda options: "-".join(options) or "default")
+@pytest.mark.parametrize("map_name", MAPS)
+def test_layout(map_name: str, options: dict[str, Any]) -> None:
+    env, reference = parallel_env(map_name, **options), Reference(map_name, options)
+    spec, rng = battle_spec(map_name, **options), np.random.default_rng(3)
+    for episode in range(12):
+        observations, _ = env.reset(seed=episode)
+        last_actions = np.zeros((spec.n_agents, spec.n_actions))
+        steps = 0
+        for _ in range(rng.integers(0, 3)):
+            actions = {agent: env.action_space(agent).sample() for agent in env.agents}
+            last_actions = np.eye(spec.n_actions)[list(actions.values())]
+            env.step(actions)
+            steps += 1
+        scatter(env, rng)
+        observations, units = env._observations(), env.snapshot()
+        enemies = [unit for unit in units if unit["team"] == "enemy"]
+        share = steps / spec.episode_limit
+        rows = [reference.observation(units, i, last_actions, share) for i in range(spec.n_agents)]
+        for i, agent in enumerate(env.agents):
+            assert observations[agent]["observation"].shape == (spec.obs_dim,)
+            np.testing.assert_allclose(observations[agent]["observation"], rows[i], atol=1e-6)
+            assert observations[agent]["action_mask"].tolist() == reference.mask(units[i], enemies)
+        state = np.concatenate(rows) if options.get("obs_instead_of_state") else None
+        wanted = reference.state(units, last_actions, share) if state is None else state
+        assert env.state().shape == (spec.state_dim,)
+        np.testing.assert_allclose(env.state(), wanted, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("map_name", "n_actions", "obs", "state", "state_without"),
+    [
+        ("3m", 9, 30, 48, 21),
+        ("8m", 14, 80, 168, 56),
+        ("25m", 31, 250, 950, 175),
+        ("5m_vs_6m", 12, 55, 98, 38),
+        ("8m_vs_9m", 15, 85, 179, 59),
+        ("10m_vs_11m", 17, 105, 243, 73),
+        ("27m_vs_30m", 36, 285, 1170, 198),
+        ("2s3z", 11, 80, 120, 65),
+        ("3s5z", 14, 128, 216, 104),
+        ("3s5z_vs_3s6z", 15, 136, 230, 110),
+        ("3s_vs_3z", 9, 36, 54, 27),
+        ("3s_vs_4z", 10, 42, 61, 31),
+        ("3s_vs_5z", 11, 48, 68, 35),
+    ],
+)
+def test_sizes_are_those_of_smac(
+    map_name: str, n_actions: int, obs: int, state: int, state_without: int
+) -> None:
+    spec = battle_spec(map_name)
+    assert (spec.n_actions, spec.obs_dim, spec.state_dim) == (n_actions, obs, state)
+    assert battle_spec(map_name, state_last_action=False).state_dim == state_without
+
+
+def test_allies_are_in_the_order_of_smac() -> None:
+    env = parallel_env("3s5z")
+    env.reset(seed=0)
+    allies = [(u["unit_type"], u["x"], u["y"]) for u in env.snapshot() if u["team"] == "ally"]
+    assert allies == sorted(allies)

@@ -196,6 +196,23 @@ def bench_rollout_command(map_name: Map = "3m", as_json: Json = False) -> None:
     _print_result(bench_rollout(EnvConfig(map=map_name)), as_json)
 
 
+@bench.command("learner")
+def bench_learner_command(
+    map_name: Map = "3m",
+    algorithm: Annotated[str, typer.Option(help="liir or central_v.")] = "liir",
+    steps: Annotated[int, typer.Option(min=2, help="Mean length of the episodes.")] = 25,
+    settings: options.Settings = None,
+    as_json: Json = False,
+) -> None:
+    """Learner steps on synthetic batches, against the time of their matrix products alone."""
+    from liir_common import config
+    from liir_common.rollout.play import env_spec
+
+    chosen = config.load(None, [f"env.map={map_name}", f"algorithm.name={algorithm}", *(settings or ())])
+    bench_learner = importlib.import_module("services.learner.bench").bench_learner
+    _print_result(bench_learner(chosen.algorithm, env_spec(chosen.env), steps=steps), as_json)
+
+
 @bench.command("wire")
 def bench_wire_command(
     map_name: Map = "3m", streams: Annotated[int, typer.Option(min=1)] = 4, as_json: Json = False
@@ -223,7 +240,11 @@ def _print_result(result: dict[str, Any], as_json: bool) -> None:
         print(json.dumps(result))
         return
     for name, value in result.items():
-        print(f"{name:32} {value:,.4g}" if isinstance(value, float) else f"{name:32} {value}")
+        if isinstance(value, dict):
+            for key, inner in value.items():
+                _print_result({f"{name} {key} {k}": v for k, v in inner.items()}, as_json=False)
+        else:
+            print(f"{name:32} {value:,.4g}" if isinstance(value, float) else f"{name:32} {value}")
 
 
 if __name__ == "__main__":

@@ -51,7 +51,7 @@ def reset(tables, battle, seed):
         battle.x[i], battle.y[i] = tables.specs[i].spawn_x, tables.specs[i].spawn_y
         _spawn(battle.units[i], tables.specs[i], i >= n_allies)
     for _ in range(rules.head_start):
-        _play_loop(tables, battle)
+        _play_loop(tables, battle, True)
 
 
 @inlined
@@ -78,10 +78,11 @@ def step(tables, battle, actions):
     dead_allies, dead_enemies = status[DEAD_ALLIES], status[DEAD_ENEMIES]
     allies = _vitality(battle.units, 0, rules.n_allies)
     enemies = _vitality(battle.units, rules.n_allies, len(battle.units))
+    upwards = rng.next_u64(battle.stream) < _HALF
     for loop in range(LOOPS_PER_STEP):
         if loop == rules.order_latency:
             _give_orders(tables, battle, actions)
-        _play_loop(tables, battle)
+        _play_loop(tables, battle, upwards)
     for i in range(rules.n_allies):
         battle.last_actions[i] = actions[i]
     status[STEPS] += 1
@@ -174,13 +175,13 @@ def _interrupt(rules, now, unit, spec):
 
 
 @inlined
-def _play_loop(tables, battle):
-    """Let every living unit act once, upwards or downwards by a coin toss.
+def _play_loop(tables, battle, upwards):
+    """Let every living unit act once, upwards or downwards.
 
-    So each of two units acts first with probability 1/2, and the processor can guess what comes next.
+    Each step tosses a coin for it: of two units each is first with probability 1/2, as in the game's random
+    order, and the processor can guess what comes next.
     """
     now, n = battle.clock[0], len(battle.units)
-    upwards = rng.next_u64(battle.stream) < _HALF
     walkers = 0
     for k in range(n):
         # Unsigned, so that no index needs a test for being negative.
@@ -200,6 +201,8 @@ def _act(tables, battle, i, now, upwards):
     unit, spec = battle.units[i], tables.specs[i]
     if unit.shield < spec.shield and now >= unit.hurt_at + _SHIELD_DELAY:
         unit.shield = min(spec.shield, unit.shield + _SHIELD_PER_LOOP)
+    if spec.regeneration > 0.0:
+        unit.health = min(spec.health, unit.health + spec.regeneration)
     if unit.hits > 0:
         if now >= unit.hit_at:
             _release(tables, battle, i, now)
@@ -220,7 +223,7 @@ def _act(tables, battle, i, now, upwards):
 def _acquire(tables, battle, i, now, upwards):
     """Keep the target while it may be kept, else take the nearest within the scan range.
 
-    Equal distances are decided by where the look begins, and so by a coin toss.
+    Equal distances are decided by where the look begins, and so by the step's coin toss.
     """
     units, unit, kind, rules = battle.units, battle.units[i], tables.specs[i].kind, tables.rules[0]
     if unit.target >= 0:

@@ -42,15 +42,19 @@ class Scenario:
     enemy_type_order: tuple[str, ...] = ()
 
 
-def _rectangle(x0: int, x1: int, y0: int, y1: int) -> NDArray[np.bool_]:
-    grid = np.zeros((MAP_SIZE, MAP_SIZE), np.bool_)
-    grid[x0:x1, y0:y1] = True
-    return grid
+def _arena(x0: int, x1: int, y0: int, y1: int, south: int = 0, north: int = 0) -> NDArray[np.bool_]:
+    """Cells x0 <= x < x1, y0 <= y < y1 without the triangles of those sizes at the corners."""
+    x, y = np.indices((MAP_SIZE, MAP_SIZE))
+    inside = (x0 <= x) & (x < x1) & (y0 <= y) & (y < y1)
+    from_side = np.minimum(x - x0, x1 - 1 - x)
+    return inside & (from_side + y - y0 >= south) & (from_side + y1 - 1 - y >= north)
 
 
 TERRAINS: Mapping[str, NDArray[np.bool_]] = {
-    "lane": _rectangle(2, 30, 7, 25),
-    "open": _rectangle(2, 30, 2, 30),
+    "lane": _arena(2, 30, 7, 25),
+    "open": _arena(2, 30, 2, 30),
+    "rounded_square": _arena(7, 23, 7, 21, south=3, north=3),
+    "pentagon": _arena(7, 21, 7, 25, south=1, north=5),
 }
 """[32, 32] by (x, y), true where ground units can stand."""
 
@@ -93,6 +97,23 @@ _SCENARIOS = (
     _facing("3s_vs_3z", {"stalker": 3}, {"zealot": 3}, limit=150, terrain="open"),
     _facing("3s_vs_4z", {"stalker": 3}, {"zealot": 4}, limit=200, terrain="open"),
     _facing("3s_vs_5z", {"stalker": 3}, {"zealot": 5}, limit=250, terrain="open"),
+    Scenario(
+        "6h_vs_8z",
+        allies=(Spawn("hydralisk", 6, 14.5998, 9.49),),
+        enemies=(Spawn("zealot", 8, 14.41, 16.7597),),
+        goal=(14.5998, 9.49),
+        limit=150,
+        terrain="rounded_square",
+    ),
+    # The spine crawler has no order in the game; its goal here is where it stands.
+    Scenario(
+        "2s_vs_1sc",
+        allies=(Spawn("stalker", 1, 11.1208, 10.338), Spawn("stalker", 1, 16.976, 10.3662)),
+        enemies=(Spawn("spine_crawler", 1, 13.92, 20.0397),),
+        goal=(13.92, 20.0397),
+        limit=300,
+        terrain="pentagon",
+    ),
 )
 
 SCENARIOS: Mapping[str, Scenario] = {scenario.name: scenario for scenario in _SCENARIOS}

@@ -56,8 +56,8 @@ SPEC = np.dtype(
     + [
         (name, np.float64)
         for name in (
-            "health", "shield", "armor", "radius", "speed", "period", "damage_point", "backswing",
-            "hit_interval", "missile_speed", "cooldown_norm", "per_health", "per_shield",
+            "health", "shield", "armor", "regeneration", "radius", "speed", "period", "damage_point",
+            "backswing", "hit_interval", "missile_speed", "cooldown_norm", "per_health", "per_shield",
             "spawn_x", "spawn_y", "goal_x", "goal_y",
         )
     ],
@@ -206,6 +206,7 @@ def _spec(unit: UnitType, kind: int, type_bit: int, spawn: NDArray[np.float64]) 
         "health": unit.health,
         "shield": unit.shield,
         "armor": unit.armor,
+        "regeneration": unit.regeneration / loops,
         "per_health": 1 / unit.health,
         "per_shield": 1 / unit.shield if unit.shield else 0.0,
         "radius": unit.radius,

@@ -54,6 +54,8 @@ class UnitType:
     """SMAC v1 divides the cooldown by this in its global state."""
     shield: float = 0.0
     armor: float = 0.0
+    regeneration: float = 0.0
+    """Points of life per second"""
 
 
 _TYPES = (
@@ -91,6 +93,31 @@ _TYPES = (
         weapon=Weapon(8, range=0.1, scan_range=5, period=1.2, damage_point=0, hits=2, hit_interval=0.28),
         cooldown_norm=22,
     ),
+    # Its second weapon, for short distances, does the same damage and is left out.
+    UnitType(
+        "hydralisk",
+        health=80,
+        regeneration=0.2734,
+        radius=0.625,
+        separation_radius=0.5,
+        speed=2.25,
+        attributes=frozenset({"light", "biological"}),
+        weapon=Weapon(12, range=5, scan_range=5.5, period=0.825, damage_point=0.208, missile_speed=40),
+        cooldown_norm=10,
+    ),
+    # How long its tentacle takes is not known; the hit comes at the damage point.
+    UnitType(
+        "spine_crawler",
+        health=300,
+        regeneration=0.2734,
+        armor=2,
+        radius=0.875,
+        separation_radius=0.875,
+        speed=0,
+        attributes=frozenset({"armored", "biological", "structure"}),
+        weapon=Weapon(25, range=7, scan_range=7, period=1.85, damage_point=0.3332, bonus={"armored": 5}),
+        cooldown_norm=15,
+    ),
 )
 
 UNIT_TYPES: Mapping[str, UnitType] = {unit.name: unit for unit in _TYPES}
@@ -100,6 +127,8 @@ _LIBERTY_WEAPONS: Mapping[str, Weapon] = {
     "stalker": replace(
         UNIT_TYPES["stalker"].weapon, damage=10, bonus={"armored": 4}, period=1.44, scan_range=6
     ),
+    "hydralisk": replace(UNIT_TYPES["hydralisk"].weapon, period=0.83, scan_range=5),
+    "spine_crawler": replace(UNIT_TYPES["spine_crawler"].weapon, period=1.6),
 }
 LIBERTY_UNIT_TYPES: Mapping[str, UnitType] = {
     name: replace(unit, weapon=_LIBERTY_WEAPONS.get(name, unit.weapon)) for name, unit in UNIT_TYPES.items()

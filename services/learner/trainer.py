@@ -21,6 +21,7 @@ from liir_common.checkpoint import Manifest, pack
 from liir_common.rpc.gen.liir.v1 import training_pb2
 from liir_common.types import Batch, Trajectory, Weights
 from services.learner.algorithms import Algorithm
+from services.learner.algorithms.runtime import set_up_process
 from services.learner.intake import Opening
 from services.learner.run_directory import Counters, RunDirectory
 
@@ -92,7 +93,7 @@ class Trainer:
 
     def run(self) -> None:
         """Train; the state is saved when this returns."""
-        torch.set_num_threads(self.config.learner.threads)
+        set_up_process(self.config.learner.threads)
         for opening, weights in () if self.complete else self._openings:
             self._publish(opening, weights)
         while not (self._stopping or self.complete) and self._step():

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
 import pytest
 
 from liir_common.battle.env import BattleEnv, UnitRecord, parallel_env
+from liir_common.battle.parameters import Parameters, Settings
+from liir_common.battle.policies import CLOSEST_ENEMY, RANDOM
+from liir_common.battle.policies import play as play_policy
+from liir_common.battle.scenarios import TERRAINS, make_battle
 
 STOP, NORTH, SOUTH, EAST, WEST, ATTACK = range(1, 7)
 FAR = {"x": 29.0, "y": 24.0}
@@ -24,7 +29,7 @@ def stage(env: BattleEnv, changes: Mapping[tuple[str, int], Mapping[str, Any]], 
         if key in changes:
             record.update({"order": "idle", **changes[key]})  # type: ignore[typeddict-item]
         else:
-            record.update({"alive": False, "health": 0.0, "shield": 0.0, **FAR})  # type: ignore[typeddict-item]
+            record.update({"alive": False, "health": 0.0, "shield": 0.0})  # type: ignore[typeddict-item]
     env.restore(records)
 
 
@@ -199,12 +204,12 @@ def test_enemies_take_the_nearest_and_stick_to_it() -> None:
     play(env, {})
     assert unit(env, "enemy", 0)["target"] == 0
     records = env.snapshot()
-    records[1].update(x=12.0, y=15.0)
+    records[1]["x"], records[1]["y"] = 12.0, 15.0
     env.restore(records)
     play(env, {})
     assert unit(env, "enemy", 0)["target"] == 0, "a nearer unit is no reason to change"
     records = env.snapshot()
-    records[0].update(alive=False, health=0.0)
+    records[0]["alive"], records[0]["health"] = False, 0.0
     env.restore(records)
     play(env, {})
     assert unit(env, "enemy", 0)["target"] == 1, "a dead target is"
@@ -324,3 +329,55 @@ def test_enemies_walk_to_the_goal_in_formation() -> None:
     walked = np.array(now) - np.array(start)
     assert walked == pytest.approx(np.tile(walked[0], (3, 1)))
     assert np.hypot(*walked[0]) == pytest.approx(4 * 1.125)
+
+
+def test_zerg_life_regenerates() -> None:
+    env = parallel_env("6h_vs_8z")
+    stage(env, {("ally", 0): {"x": 12.0, "y": 9.0, "health": 50.0}, ("enemy", 0): {"x": 18.0, "y": 19.0}})
+    play(env, {}, steps=4)
+    assert unit(env, "ally", 0)["health"] == pytest.approx(50 + 2 * 0.2734)
+
+
+def test_a_spine_crawler_stays_and_reaches_far() -> None:
+    env = parallel_env("2s_vs_1sc")
+    crawler = {"order": "attack_move"}
+    stage(env, {("ally", 0): {"x": 13.92, "y": 20.0397 - 8.4}, ("enemy", 0): crawler})
+    play(env, {}, steps=3)
+    assert unit(env, "ally", 0)["shield"] == 80 - 30
+    assert (unit(env, "enemy", 0)["x"], unit(env, "enemy", 0)["y"]) == (13.92, 20.0397)
+
+
+def test_terrains_have_cut_corners() -> None:
+    pentagon = TERRAINS["pentagon"]
+    assert np.flatnonzero(pentagon[:, 24]).tolist() == [12, 13, 14, 15]
+    assert np.flatnonzero(pentagon[:, 19]).tolist() == list(range(7, 21))
+    assert np.flatnonzero(pentagon[:, 7]).tolist() == list(range(8, 20))
+    assert TERRAINS["rounded_square"].sum() == 16 * 14 - 4 * 6
+    assert TERRAINS["lane"].sum() == 28 * 18
+
+
+CHANGED: dict[str, Any] = {
+    "head_start": 5,
+    "order_latency": 3,
+    "slide": 0.2,
+    "rescan_period": 1,
+    "redirect_missiles": True,
+    "cooldown_from_release": True,
+}
+
+
+@pytest.mark.parametrize("name", [field.name for field in fields(Parameters)])
+def test_every_parameter_matters(name: str) -> None:
+    """In some battle of two maps; what it does has tests above, or none if it only moves the statistics."""
+    default = getattr(Settings(), name)
+    other = CHANGED.get(name, not default)
+    assert other != default
+    differs = False
+    for map_name in ("3s5z", "3s_vs_5z"):
+        outcomes = [
+            play_policy(make_battle(map_name, **{name: value})[0], policy, episodes=40)
+            for value in (default, other)
+            for policy in (RANDOM, CLOSEST_ENEMY)
+        ]
+        differs |= not np.array_equal(outcomes[:2], outcomes[2:])
+    assert differs

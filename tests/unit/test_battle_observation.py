@@ -11,7 +11,7 @@ from liir_common.battle.env import BattleEnv, UnitRecord, battle_spec, parallel_
 from liir_common.battle.scenarios import SCENARIOS, TERRAINS
 
 SIGHT, SHOOT_RANGE = 9.0, 6.0
-COOLDOWN_MAX = {"marine": 15, "stalker": 35, "zealot": 22}
+COOLDOWN_MAX = {"marine": 15, "stalker": 35, "zealot": 22, "hydralisk": 10, "spine_crawler": 15}
 ALLY_BITS = {"stalker": 0, "zealot": 1}
 ENEMY_BITS = {"zealot": 0, "stalker": 1}
 DEFAULTS: dict[str, Any] = {
@@ -31,7 +31,7 @@ OPTIONS: tuple[dict[str, Any], ...] = (
     {"obs_all_health": False},
     {"obs_all_health": False, "obs_own_health": False, "obs_instead_of_state": True},
 )
-MAPS = ("3m", "5m_vs_6m", "8m", "2s3z", "3s5z", "3s_vs_4z")
+MAPS = ("3m", "5m_vs_6m", "8m", "2s3z", "3s5z", "3s_vs_4z", "6h_vs_8z", "2s_vs_1sc")
 
 
 class Reference:
@@ -42,7 +42,7 @@ class Reference:
         self.options = DEFAULTS | options
         self.options["obs_own_health"] |= self.options["obs_all_health"]
         self.pathing = TERRAINS[self.scenario.terrain]
-        self.mixed = "z" in map_name and "vs" not in map_name
+        self.mixed = map_name in ("2s3z", "3s5z")
 
     def is_open(self, x: int, y: int, outside: bool) -> bool:
         inside = 0 <= x < 32 and 0 <= y < 32
@@ -128,7 +128,7 @@ def scatter(env: BattleEnv, rng: np.random.Generator) -> None:
     pathing = env._tables.pathing
     for record in records:
         while not pathing[int(record["x"]), int(record["y"])] or rng.random() < 0.5:
-            record["x"], record["y"] = rng.uniform(2, 18), rng.uniform(4, 26)
+            record["x"], record["y"] = rng.uniform(2, 20), rng.uniform(4, 26)
         alive = bool(rng.random() < 0.8)
         record["alive"] = alive
         record["health"] = float(rng.integers(1, int(record["health_max"]))) if alive else 0.0
@@ -184,6 +184,8 @@ def test_layout(map_name: str, options: dict[str, Any]) -> None:
         ("3s_vs_3z", 9, 36, 54, 27),
         ("3s_vs_4z", 10, 42, 61, 31),
         ("3s_vs_5z", 11, 48, 68, 35),
+        ("6h_vs_8z", 14, 78, 140, 56),
+        ("2s_vs_1sc", 7, 17, 27, 13),
     ],
 )
 def test_sizes_are_those_of_smac(

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from liir_common.battle.env import UnitRecord, parallel_env
-from tests.unit.test_battle_mechanics import ATTACK, play, stage
+from tests.unit.test_battle_mechanics import ATTACK, STOP, play, stage
 
 DEFAULTS: dict[str, Any] = {
     "reward_only_positive": True,
@@ -92,7 +92,12 @@ def test_against_the_slow_one(map_name: str, options: dict[str, Any]) -> None:
                 a: next((k for k in range(ATTACK, len(m)) if m[k]), None)
                 for a, m in zip(env.agents, env._masks, strict=True)
             }
-            actions = {a: near[a] or env.action_space(a).sample() for a in env.agents}
+            # Strong teams wait for the enemy, frail ones do anything.
+            waits = frail == "enemy"
+            actions = {
+                a: near[a] or (STOP if waits and m[STOP] else env.action_space(a).sample())
+                for a, m in zip(env.agents, env._masks, strict=True)
+            }
             _, rewards, _, _, infos = env.step(actions)
             assert len(set(rewards.values())) == 1
             assert rewards["ally_0"] == pytest.approx(slow_reward(before, env.snapshot(), options), abs=1e-9)

@@ -34,8 +34,8 @@ def batch_of(seed: int) -> Batch:
     return synthetic_batch(SPEC, episodes=6, steps=6, seed=seed, policy_version=seed, epsilon=0.2)
 
 
-def assert_equal_states(a: Algorithm, b: Algorithm) -> None:
-    x, y = a.state(), b.state()
+def assert_equal_states(a: Algorithm, b: Algorithm, *, but_for: str = "nothing") -> None:
+    x, y = ({k: v for k, v in s.items() if not k.startswith(but_for)} for s in (a.state(), b.state()))
     assert x.keys() == y.keys()
     assert [name for name in x if not torch.equal(x[name], y[name])] == []
 
@@ -47,7 +47,8 @@ def test_going_on_from_a_saved_state_equals_never_having_stopped(method: str) ->
         straight.update(batch_of(seed))
     saved = straight.state()
     resumed = make(method, seed=6)
-    resumed.update(batch_of(7))
+    for seed in range(2):
+        resumed.update(batch_of(seed))
     resumed.load_state(saved)
     assert_equal_states(straight, resumed)
     for seed in range(4, 8):
@@ -128,9 +129,7 @@ def test_garbage_after_the_mask_changes_nothing(method: str, dead: bool) -> None
         garbage = with_garbage(batch, dead=dead)
         assert not np.array_equal(batch.obs, garbage.obs)
         assert clean.update(batch) == dirty.update(garbage)
-    x, y = clean.state(), dirty.state()
-    wrong = [name for name in x if not name.startswith("pending.batch") and not torch.equal(x[name], y[name])]
-    assert wrong == []
+    assert_equal_states(clean, dirty, but_for="pending.batch")
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -142,10 +141,12 @@ def test_a_life_may_have_a_gap(method: str) -> None:
     alive[b, t + 1, i] = False
     assert alive[b, t + 2, i]
     batch = replace(batch, alive=alive)
-    log_mu = batch.log_mu.copy()
+    log_mu, mask = batch.log_mu.copy(), batch.mask.copy()
     log_mu[b, t + 1, i] = -3
+    mask[b, t + 1, i] = False
     clean, dirty = make(method), make(method)
-    assert clean.update(batch) == dirty.update(replace(batch, log_mu=log_mu))
+    assert clean.update(batch) == dirty.update(replace(batch, log_mu=log_mu, mask=mask))
+    assert_equal_states(clean, dirty, but_for="pending.batch")
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -162,6 +163,16 @@ def test_the_dead_still_teach_the_values(method: str) -> None:
     other.update(replace(batch, reward=late))
     name = "varphi.parameters" if method.startswith("central_v") else "phi.parameters"
     assert not torch.equal(base.state()[name], other.state()[name])
+
+
+def test_targets_are_copied_at_every_interval() -> None:
+    algorithm = make("liir paper")
+    followed = []
+    for seed in range(7):
+        algorithm.update(batch_of(seed))
+        state = algorithm.state()
+        followed.append(torch.equal(state["phi.target"], state["phi.parameters"]))
+    assert followed == [False, False, True, False, False, True, False]
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -42,10 +42,13 @@ def config_of(case: dict[str, object]) -> AlgorithmConfig:
 
 
 def batch_of(seed: int, version: int = 0) -> Batch:
-    """Padding, deaths, truncation, and a behaviour policy that is not the learner's."""
+    """Padding, deaths, a gap in a life, truncation, and a behaviour policy that is not the learner's."""
     batch = synthetic_batch(SPEC, episodes=6, steps=6, seed=seed, policy_version=version, epsilon=0.2)
     noise = np.random.default_rng(seed).normal(0, 0.3, batch.log_mu.shape).astype(np.float32)
-    return replace(batch, log_mu=batch.log_mu + noise)
+    alive = batch.alive.copy()
+    assert alive[0, :3, 0].all()
+    alive[0, 1, 0] = False
+    return replace(batch, alive=alive, log_mu=batch.log_mu + noise)
 
 
 @dataclass

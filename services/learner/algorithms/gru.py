@@ -59,11 +59,20 @@ def forward(inputs: Tensor, weight: Tensor, bias_n: Tensor, sizes: list[int]) ->
         h = torch.lerp(n_t, h, z_t, out=h_t)
     before = zip(h_all.split_with_sizes(sizes), sizes[1:], strict=False)
     previous = torch.cat([torch.zeros_like(h_all[: sizes[0]]), *(h_t[:size] for h_t, size in before)])
-    not_z = 1 - z
-    to_n = (1 - n * n) * not_z
-    to_r = to_n * recurrent_n * r * (1 - r)
-    to_z = (previous - n) * z * not_z
-    return Trace(sizes, h_all, previous, z, to_n, torch.stack([to_r, to_z, to_n * r], 1))
+    to_n, to_gates = _linearise(previous, r, z, n, recurrent_n)
+    return Trace(sizes, h_all, previous, z, to_n, to_gates)
+
+
+def _linearise(
+    previous: Tensor, r: Tensor, z: Tensor, n: Tensor, recurrent_n: Tensor
+) -> tuple[Tensor, Tensor]:
+    """to_n [R, H] and to_gates [R, 3, H]; x - x² is the sigmoid's derivative, 1 - n² that of tanh."""
+    to_n = torch.addcmul(z.new_ones(()), n, n, value=-1).mul_(1 - z)
+    to_gates = z.new_empty(len(z), 3, z.shape[1])
+    torch.mul(torch.addcmul(r, r, r, value=-1).mul_(recurrent_n), to_n, out=to_gates[:, 0])
+    torch.mul(torch.addcmul(z, z, z, value=-1), previous - n, out=to_gates[:, 1])
+    torch.mul(to_n, r, out=to_gates[:, 2])
+    return to_n, to_gates
 
 
 def backward(trace: Trace, weight: Tensor, grad_h: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -129,7 +129,8 @@ class IntrinsicReward(Mlp):
 
 
 def _above(p: Mapping[str, Tensor], first: Tensor) -> Tensor:
-    hidden = functional.linear(first.relu(), p["fc2.weight"], p["fc2.bias"]).relu()
+    """The layers above the first, whose outputs before the ReLU are overwritten."""
+    hidden = functional.linear(first.relu_(), p["fc2.weight"], p["fc2.bias"]).relu_()
     return functional.linear(hidden, p["fc3.weight"], p["fc3.bias"])
 
 

@@ -6,9 +6,9 @@ mutable state. Units are numbered allies first, in SMAC v1's order, then enemies
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields
-from math import ceil, cos, hypot, pi, sin, sqrt
+from math import cos, dist, pi, sin
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -20,6 +20,10 @@ from liir_common.battle.units import LIBERTY_UNIT_TYPES, LOOPS_PER_SECOND, UNIT_
 
 if TYPE_CHECKING:
     from liir_common.battle.scenarios import Scenario, Spawn
+
+_Place = tuple[float, float]
+_Disc = tuple[_Place, float]
+"""A place and the radius of what stands there"""
 
 # Without numba's reference counting a kernel is five times as fast, and cannot allocate.
 _OPTIONS: Any = {"error_model": "numpy", "_nrt": False}
@@ -127,17 +131,20 @@ def roster(scenario: Scenario, settings: Settings) -> tuple[list[UnitType], NDAr
 
 
 def _muster(
-    spawns: Sequence[Spawn], types: Any, settings: Settings
-) -> list[tuple[UnitType, tuple[float, float]]]:
-    place = _on_grid if settings.grid_spawn else _in_rings
-    units: list[tuple[UnitType, tuple[float, float]]] = []
-    taken: list[tuple[float, float, float]] = []
+    spawns: Sequence[Spawn], types: Mapping[str, UnitType], settings: Settings
+) -> list[tuple[UnitType, _Place]]:
+    """Put units one by one on the free place nearest to their point, as the candidates come."""
+    candidates = _on_grid if settings.grid_spawn else _in_rings
+    units: list[tuple[UnitType, _Place]] = []
+    discs: list[_Disc] = []
     for spawn in spawns:
-        unit = types[spawn.unit_type]
+        unit, point = types[spawn.unit_type], (spawn.x, spawn.y)
+        body = _body(unit, settings)
         for _ in range(spawn.count):
-            x, y = place(spawn.x, spawn.y, _body(unit, settings), taken)
-            taken.append((x, y, _body(unit, settings)))
-            units.append((unit, (x, y)))
+            free = [place for place in candidates(point, body, discs) if _is_free(place, body, discs)]
+            place = min(free, key=lambda place: round(dist(place, point), 6))
+            discs.append((place, body))
+            units.append((unit, place))
     return units
 
 
@@ -145,35 +152,23 @@ def _body(unit: UnitType, settings: Settings) -> float:
     return unit.separation_radius if settings.separation_collision else unit.radius
 
 
-def _in_rings(
-    x: float, y: float, radius: float, taken: Sequence[tuple[float, float, float]]
-) -> tuple[float, float]:
-    """The free place nearest to a point, out of the six around every unit that already stands."""
-    places = [(x, y)] + [
-        (tx + (radius + body) * cos(k * pi / 3), ty + (radius + body) * sin(k * pi / 3))
-        for tx, ty, body in taken
+def _in_rings(point: _Place, body: float, discs: Sequence[_Disc]) -> list[_Place]:
+    """The point, and the six places around every unit that already stands."""
+    return [point] + [
+        (x + (body + other) * cos(k * pi / 3), y + (body + other) * sin(k * pi / 3))
+        for (x, y), other in discs
         for k in range(6)
     ]
-    return min(
-        (p for p in places if _is_free(p, radius, taken)), key=lambda p: round(hypot(p[0] - x, p[1] - y), 6)
-    )
 
 
-def _on_grid(
-    x: float, y: float, radius: float, taken: Sequence[tuple[float, float, float]]
-) -> tuple[float, float]:
-    """The free place nearest to a point on a square grid around it."""
-    side = ceil(sqrt(len(taken) + 1)) + 1
-    places = [
-        (x + 2 * radius * i, y + 2 * radius * j) for i in range(-side, side) for j in range(-side, side)
-    ]
-    return min(
-        (p for p in places if _is_free(p, radius, taken)), key=lambda p: round(hypot(p[0] - x, p[1] - y), 6)
-    )
+def _on_grid(point: _Place, body: float, discs: Sequence[_Disc]) -> list[_Place]:
+    """A square grid around the point, with more places than units."""
+    side = range(-len(discs) - 1, len(discs) + 2)
+    return [(point[0] + 2 * body * i, point[1] + 2 * body * j) for i in side for j in side]
 
 
-def _is_free(place: tuple[float, float], radius: float, taken: Sequence[tuple[float, float, float]]) -> bool:
-    return all(hypot(place[0] - x, place[1] - y) > radius + body - 1e-6 for x, y, body in taken)
+def _is_free(place: _Place, body: float, discs: Sequence[_Disc]) -> bool:
+    return all(dist(place, other) > body + radius - 1e-6 for other, radius in discs)
 
 
 def build_tables(scenario: Scenario, settings: Settings, pathing: NDArray[np.bool_]) -> Tables:

@@ -75,6 +75,8 @@ def slow_reward(before: Sequence[UnitRecord], after: Sequence[UnitRecord], optio
 @pytest.mark.parametrize("map_name", ["3m", "8m", "2s3z"])
 def test_against_the_slow_one(map_name: str, options: dict[str, Any]) -> None:
     env = parallel_env(map_name, **options)
+    for i, agent in enumerate(env.possible_agents):
+        env.action_space(agent).seed(i)
     won = lost = 0
     for seed in range(8):
         env.reset(seed=seed)

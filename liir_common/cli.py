@@ -235,6 +235,36 @@ def bench_train_command(
     _print_result(bench_train(map_name, env_steps, settings or ()), as_json)
 
 
+@app.command()
+def calibrate(
+    map_name: Annotated[
+        str | None, typer.Option("--map", help="One map; all with targets if absent.")
+    ] = None,
+    episodes: Annotated[int, typer.Option(min=1)] = 2000,
+    as_json: Json = False,
+) -> None:
+    """Compare the simulator with what is published about SMAC v1 on StarCraft II."""
+    from dataclasses import asdict
+
+    from liir_common.battle.calibrate import TARGETS, format_rows
+    from liir_common.battle.calibrate import calibrate as measure
+
+    try:
+        tables = {name: measure(name, episodes) for name in ([map_name] if map_name else TARGETS)}
+    except ValueError as error:
+        raise ConfigError(str(error)) from None
+    if as_json:
+        rows = {
+            name: [
+                asdict(row.target) | {"measured": row.measured, "difference": row.difference} for row in table
+            ]
+            for name, table in tables.items()
+        }
+        print(json.dumps(rows))
+    else:
+        print("\n".join(format_rows(name, table) for name, table in tables.items()))
+
+
 def _print_result(result: dict[str, Any], as_json: bool) -> None:
     if as_json:
         print(json.dumps(result))

@@ -6,7 +6,6 @@ test episodes of greedy untrained networks that never attack.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -113,17 +112,3 @@ def format_rows(map_name: str, rows: list[Row]) -> str:
             f"{target.value:8.2f}{row.measured:9.2f}{row.difference:9.1%}"
         )
     return "\n".join(lines)
-
-
-def main() -> None:
-    """Command line: print the tables of the maps named, or of all that have targets."""
-    parser = argparse.ArgumentParser(description=main.__doc__)
-    parser.add_argument("maps", nargs="*", default=list(TARGETS))
-    parser.add_argument("--episodes", type=int, default=2000)
-    arguments = parser.parse_args()
-    for name in arguments.maps:
-        print(format_rows(name, calibrate(name, arguments.episodes)))
-
-
-if __name__ == "__main__":
-    main()

@@ -14,6 +14,9 @@ from liir_common.config import AlgorithmConfig
 from liir_common.types import Batch, EnvSpec, Trajectory
 from services.learner.algorithms import Algorithm, make_algorithm
 
+# On products this small a second thread only waits, and it spins while it does.
+torch.set_num_threads(1)
+
 SPEC = EnvSpec(
     "levers", "1", "{}", n_agents=3, n_actions=3, obs_dim=3, state_dim=1, episode_limit=3, info_keys=()
 )

@@ -18,6 +18,9 @@ from services.learner.algorithms.optim import Optimizer
 from services.learner.algorithms.returns import explained_variance, lambda_return, normalize
 from services.learner.bench import synthetic_batch
 
+# On products this small a second thread only waits, and it spins while it does.
+torch.set_num_threads(1)
+
 SPEC = EnvSpec("test", "1", "{}", 3, 4, 3, 5, 9, ())
 CPU = torch.device("cpu")
 

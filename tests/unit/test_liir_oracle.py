@@ -18,6 +18,9 @@ from liir_common.types import Batch, EnvSpec, policy_shapes
 from services.learner.algorithms import Algorithm, make_algorithm
 from services.learner.bench import synthetic_batch
 
+# On products this small a second thread only waits, and it spins while it does.
+torch.set_num_threads(1)
+
 SPEC = EnvSpec("test", "1", "{}", 3, 4, 3, 5, 9, ())
 CPU = torch.device("cpu")
 BETA_1, BETA_2 = 0.9, 0.999

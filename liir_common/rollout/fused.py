@@ -36,6 +36,8 @@ def _play_episode(tables, battle, policy, hidden, rows, seed, choice):
 class FusedPlayer(Player):
     """Plays battles on one map; the interpreter is free for other threads meanwhile."""
 
+    tickets_held = 4
+
     def __init__(self, map_name: str, options: dict[str, Any], policy_hidden: int) -> None:
         super().__init__(battle_spec(map_name, **options), policy_hidden)
         self._tables, self._battle = make_battle(map_name, **options)

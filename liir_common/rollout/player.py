@@ -57,6 +57,9 @@ class Ending(NamedTuple):
 class Player(ABC):
     """Plays episodes of one environment with one policy at a time; serves one thread at a time."""
 
+    tickets_held = 1
+    """Tickets to hold at a time: more than one pays where a policy takes longer to come than an episode."""
+
     def __init__(self, spec: EnvSpec, policy_hidden: int) -> None:
         self.spec = spec
         self._policy_hidden = policy_hidden

@@ -20,8 +20,6 @@ from liir_common.rpc.gen.liir.v1 import rollout_pb2, rollout_pb2_grpc
 log = structlog.get_logger()
 
 _RETRIED = (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.CANCELLED)
-_TICKETS_HELD = 2
-"""One being played and one here when it ends."""
 
 
 class RolloutActor:
@@ -68,7 +66,7 @@ class RolloutActor:
             actor_id=name, incarnation=incarnation, env_spec_hash=self._player.spec.hash, build=build()
         )
         outgoing.put(rollout_pb2.PlayRequest(hello=hello))
-        outgoing.put(rollout_pb2.PlayRequest(ready=rollout_pb2.Ready(tickets=_TICKETS_HELD)))
+        outgoing.put(rollout_pb2.PlayRequest(ready=rollout_pb2.Ready(tickets=self._player.tickets_held)))
         version, idle_since = -1, time.perf_counter()
         for message in learner.Play(iter(outgoing.get, None), wait_for_ready=True):
             match message.WhichOneof("body"):

@@ -52,7 +52,7 @@ class Intake:
         self._credits: dict[Actor, int] = {}
         """Per actor, how many tickets more it can hold."""
         self._asking: deque[Actor] = deque()
-        """Actors with credits, each once: all get a ticket before one gets its second."""
+        """Actors with credits, each once, the longest wait first."""
         self._played: dict[int, Trajectory] = {}
 
     @property
@@ -84,12 +84,16 @@ class Intake:
         self._credits[actor] += tickets
 
     def assign(self, now: float) -> Iterator[tuple[Actor, Ticket]]:
-        """Match tickets with actors, oldest episode and longest wait first."""
+        """Match tickets with actors, oldest episode and longest wait first.
+
+        An actor gets all that it can hold before the next gets any, since each needs the policy; one whose
+        episodes take long asks for one ticket at a time.
+        """
         while self._asking and (ticket := self._next_ticket()):
-            actor = self._asking.popleft()
+            actor = self._asking[0]
             self._credits[actor] -= 1
-            if self._credits[actor]:
-                self._asking.append(actor)
+            if not self._credits[actor]:
+                self._asking.popleft()
             self._held[actor][ticket.episode_id] = now
             yield actor, ticket
 

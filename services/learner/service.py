@@ -20,6 +20,7 @@ from liir_common.rpc.gen.liir.v1 import (
 from liir_common.rpc.server import Server
 from liir_common.types import EnvSpec, Weights
 from services.learner.algorithms import make_algorithm
+from services.learner.algorithms.runtime import set_up_process
 from services.learner.checkpoint_service import CheckpointService
 from services.learner.intake import Opening
 from services.learner.rollout_service import RolloutService
@@ -35,6 +36,9 @@ _STOP_GRACE_S = 2.0
 
 async def serve(config: Config, run: RunDirectory, spec: EnvSpec) -> None:
     """Train until the run is complete and its checkpoints are tested, or until asked to stop."""
+    # This thread only serves. With a pool of its own OpenMP would count more threads than cores and put
+    # the trainer's to sleep at every barrier, which doubles the time of an update.
+    set_up_process(threads=1)
     loop = asyncio.get_running_loop()
     server = Server(config.learner.host, config.learner.port, config.learner.insecure)
     metrics_port = metrics.serve(config.learner.metrics_port, "learner.metrics_port")

@@ -1,5 +1,7 @@
 """Whatever bytes arrive, decoding ends in a trajectory that could have been played or in a ValueError."""
 
+from contextlib import suppress
+
 import pytest
 from google.protobuf.message import DecodeError
 from hypothesis import given, settings
@@ -19,16 +21,11 @@ VALID = {
 
 
 def decode(wire: bytes) -> None:
-    try:
-        message = rollout_pb2.PlayRequest.FromString(wire)
-        trajectory = rollout_pb2.Trajectory.FromString(wire)
-    except DecodeError:
-        return  # gRPC answers this itself
-    try:
-        codec.check_playable(codec.decode_trajectory(trajectory, SPEC), SPEC)
-        codec.decode_trajectory(message.trajectory, SPEC)
-    except ValueError as error:
-        assert str(error)
+    """Any other error fails the test; gRPC answers the first of these itself, our servicer the second."""
+    with suppress(DecodeError, ValueError):
+        codec.check_playable(codec.decode_trajectory(rollout_pb2.Trajectory.FromString(wire), SPEC), SPEC)
+    with suppress(DecodeError, ValueError):
+        codec.decode_trajectory(rollout_pb2.PlayRequest.FromString(wire).trajectory, SPEC)
 
 
 @given(st.binary(max_size=400))

@@ -1,22 +1,33 @@
-"""What this program is: both ends of a stream must be the same build to play the same episodes."""
+"""What this program is: which episodes it plays, and which commit it runs from."""
 
+import hashlib
 import subprocess
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 
+_PACKAGE = Path(__file__).parent
+
+
+@cache
+def source_digest() -> str:
+    """SHA-256 of all sources that episodes are compiled from, as hex."""
+    files = [_PACKAGE / "rng.py", _PACKAGE / "seeds.py"]
+    for folder in ("battle", "rollout"):
+        files += sorted((_PACKAGE / folder).glob("*.py"))
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
+
 
 @cache
 def build() -> str:
-    """Version of the package and, in a git checkout, the commit ("+" marks uncommitted changes)."""
-    return f"{version('liir-service')}-{git_commit()}"
+    """Both ends of a stream must have the same: equal builds play the same episodes."""
+    return f"{version('liir-service')}-{source_digest()[:12]}"
 
 
 @cache
 def git_commit() -> str:
-    """Commit of the checkout this code runs from, or "unknown" outside one."""
-    root = Path(__file__).parent.parent
-    command = ["git", "-C", str(root), "describe", "--always", "--dirty=+", "--abbrev=12", "--exclude=*"]
+    """Commit of the checkout this runs from ("+" marks uncommitted changes), or "unknown" outside one."""
+    command = ["git", "-C", str(_PACKAGE), "describe", "--always", "--dirty=+", "--abbrev=12", "--exclude=*"]
     try:
         done = subprocess.run(command, capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError):

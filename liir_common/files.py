@@ -6,9 +6,9 @@ import csv
 import io
 import os
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 
 def write_atomic(path: Path, data: bytes) -> None:
@@ -48,7 +48,7 @@ class Table:
             self._columns += new
             self._rewrite(rows)
         with self.path.open("a", newline="", encoding="utf-8") as file:
-            self._writer(file).writerow(row)
+            csv.DictWriter(file, self._columns, lineterminator="\n").writerow(row)
 
     def keep(self, column: str, at_most: int) -> None:
         """Drop the rows whose `column` is larger; a resumed run writes them again."""
@@ -58,13 +58,16 @@ class Table:
             self._rewrite(kept)
 
     def _rewrite(self, rows: list[dict[str, str]]) -> None:
-        text = io.StringIO()
-        self._writer(text).writeheader()
-        self._writer(text).writerows(rows)
-        write_atomic(self.path, text.getvalue().encode())
+        write_atomic(self.path, csv_text(rows, self._columns).encode())
 
-    def _writer(self, file: TextIO) -> csv.DictWriter[str]:
-        return csv.DictWriter(file, self._columns, lineterminator="\n")
+
+def csv_text(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] = ()) -> str:
+    """A CSV file's text with a header; `columns` are those of the first row unless given."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns or list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
 
 
 def read_table(path: Path) -> list[dict[str, str]]:

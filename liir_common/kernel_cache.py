@@ -6,8 +6,6 @@ the function's own file has changed. After `install` it asks for all files that 
 
 from __future__ import annotations
 
-import hashlib
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -18,16 +16,9 @@ from numba.core.caching import (
     UserWideCacheLocator,
 )
 
+from liir_common.build import source_digest
+
 _PACKAGE = Path(__file__).parent
-
-
-@cache
-def source_digest() -> str:
-    """SHA-256 of all sources of kernels, as hex."""
-    files = [_PACKAGE / "rng.py", _PACKAGE / "seeds.py"]
-    for folder in ("battle", "rollout"):
-        files += sorted((_PACKAGE / folder).glob("*.py"))
-    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
 
 
 class _OfThisPackage:

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
-from liir_common.files import read_table, write_atomic
+import yaml
+
+from liir_common.files import csv_text, read_table, write_atomic
 
 _LEVEL = 0.9
 _IN_A_ROW = 3
 _LAST = 10
+_CURVE = ("episode", "env_steps", "greedy_win_rate", "sampled_win_rate")
 
 
 @dataclass(frozen=True)
@@ -63,6 +68,34 @@ def write_report(run_dir: Path) -> Summary:
     if summary.evaluations:
         plot_win_rate({run_dir.name: [run_dir]}, run_dir / "winrate.png")
     return summary
+
+
+def write_results(run_dirs: Sequence[Path], output: Path) -> None:
+    """Gather runs into `output`: runs.csv (a row per run), curves.csv (a row per evaluation), winrate.png."""
+    output.mkdir(parents=True, exist_ok=True)
+    groups: dict[str, list[Path]] = {}
+    runs, curves = [], []
+    for run_dir in run_dirs:
+        config = yaml.safe_load((run_dir / "config.yaml").read_text(encoding="utf-8"))
+        run = json.loads((run_dir / "run.json").read_text())
+        label = _label(config["algorithm"])
+        groups.setdefault(label, []).append(run_dir)
+        about = {"run": run_dir.name, "method": label, "map": config["env"]["map"], "seed": config["seed"]}
+        runs.append({**about, "commit": run["git"], **asdict(summarise(run_dir))})
+        curves += [
+            {"run": run_dir.name} | {column: test[column] for column in _CURVE}
+            for test in read_table(run_dir / "evaluations.csv")
+        ]
+        write_atomic(output / f"{run_dir.name}.yaml", (run_dir / "config.yaml").read_bytes())
+    for name, rows in (("runs", runs), ("curves", curves)):
+        write_atomic(output / f"{name}.csv", csv_text(rows).encode())
+    plot_win_rate(groups, output / "winrate.png")
+
+
+def _label(algorithm: Mapping[str, Any]) -> str:
+    controls = {"λ = 0": algorithm["lambda"] == 0, "η frozen": algorithm["freeze_eta"]}
+    chosen = [name for name, on in controls.items() if on and algorithm["name"] == "liir"]
+    return ", ".join([algorithm["name"], *chosen])
 
 
 def plot_win_rate(groups: dict[str, list[Path]], output: Path) -> None:

@@ -1,11 +1,14 @@
 """Summary and curve of a run, from its files alone."""
 
+import json
 from pathlib import Path
 
 import pytest
+import yaml
 
-from liir_common.files import Table
-from liir_common.report import summarise, write_report
+from liir_common import config
+from liir_common.files import Table, read_table
+from liir_common.report import summarise, write_report, write_results
 
 
 def make_run(path: Path, greedy: list[float]) -> Path:
@@ -53,3 +56,19 @@ def test_the_curve_is_a_picture(tmp_path: Path) -> None:
     run = make_run(tmp_path / "run", [0.0, 0.5, 1.0])
     write_report(run)
     assert (run / "winrate.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_results_gather_runs_by_method(tmp_path: Path) -> None:
+    runs = []
+    for name, settings in (("a", []), ("b", ["algorithm.lambda=0"]), ("c", ["algorithm.name=central_v"])):
+        run = make_run(tmp_path / name, [0.5, 1.0])
+        (run / "config.yaml").write_text(yaml.safe_dump(config.load(None, settings).tree()))
+        (run / "run.json").write_text(json.dumps({"git": "abc"}))
+        runs.append(run)
+    write_results(runs, tmp_path / "results")
+    rows = read_table(tmp_path / "results" / "runs.csv")
+    assert [row["method"] for row in rows] == ["liir", "liir, λ = 0", "central_v"]
+    assert {row["commit"] for row in rows} == {"abc"}
+    assert len(read_table(tmp_path / "results" / "curves.csv")) == 6
+    assert config.load(tmp_path / "results" / "b.yaml", ["preset=none"]).algorithm.lambda_ == 0
+    assert (tmp_path / "results" / "winrate.png").exists()

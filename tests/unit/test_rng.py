@@ -13,7 +13,7 @@ import pytest
 from numba.core.caching import FunctionCache
 from numba.core.dispatcher import Dispatcher
 
-from liir_common import kernel_cache, rng, seeds
+from liir_common import build, rng, seeds
 
 EDGES = [0, 1, 2, 12345, 2**31, 2**63 - 1, 2**63, 2**64 - 1]
 
@@ -96,4 +96,4 @@ def test_every_cached_kernel_of_the_package_is_watched() -> None:
         cached = [kernel for kernel in kernels if isinstance(kernel._cache, FunctionCache)]
         assert cached
         stamps = {kernel._cache._impl.locator.get_source_stamp() for kernel in cached}
-        assert stamps == {kernel_cache.source_digest()}
+        assert stamps == {build.source_digest()}

@@ -22,12 +22,14 @@ from liir_common.rpc.gen.liir.v1 import (
 
 _PAGE = 1000
 _DOWNLOAD_TRIES = 5
+_WATCH_S = 20.0
+"""After that a stream is asked for anew, from where it was: no silence is taken for a wait for ever."""
 
 
 class CheckpointClient:
     """Lists, downloads and watches the checkpoints of one learner."""
 
-    def __init__(self, address: str, timeout_s: float | None = 30.0) -> None:
+    def __init__(self, address: str, timeout_s: float = 30.0) -> None:
         """Connect to the learner at HOST:PORT.
 
         Raises:
@@ -87,9 +89,17 @@ class CheckpointClient:
         Raises:
             grpc.RpcError: the connection broke; watch again from the last position seen.
         """
-        request = checkpoint_pb2.WatchCheckpointsRequest(after_episode=after_episode)
-        for response in self._stub.WatchCheckpoints(request):
-            yield response.checkpoint
+        while True:
+            request = checkpoint_pb2.WatchCheckpointsRequest(after_episode=after_episode)
+            try:
+                for response in self._stub.WatchCheckpoints(request, timeout=_WATCH_S):
+                    yield response.checkpoint
+                    after_episode = response.checkpoint.episode
+            except grpc.RpcError as error:
+                if error.code() != grpc.StatusCode.DEADLINE_EXCEEDED:
+                    raise
+            else:
+                return
 
     def report(self, evaluation: checkpoint_pb2.Evaluation) -> bool:
         """Hand in the test of a checkpoint; false if it had one already."""
@@ -119,7 +129,7 @@ class CheckpointClient:
 class TrainingClient:
     """Asks a learner about its run."""
 
-    def __init__(self, address: str, timeout_s: float | None = 30.0) -> None:
+    def __init__(self, address: str, timeout_s: float = 30.0) -> None:
         """Connect to the learner at HOST:PORT.
 
         Raises:

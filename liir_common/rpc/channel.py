@@ -15,11 +15,20 @@ DEADLINE_S = 10.0
 KEEPALIVE_MS, KEEPALIVE_TIMEOUT_MS = 5_000, 3_000
 """A peer that answers no ping is given up after at most their sum."""
 
-# Only UNAVAILABLE is retried: the call may not have arrived. gRPC adds the jitter.
+# Only UNAVAILABLE is retried, the call may not have arrived, and only for unary calls: who reads a stream
+# knows from where to go on. gRPC adds the jitter.
+_RETRIED = {
+    "CheckpointService": ("ListCheckpoints", "ReportEvaluation", "ListEvaluations"),
+    "TrainingService": ("GetRun", "GetStatus", "Stop"),
+}
 _SERVICE_CONFIG = {
     "methodConfig": [
         {
-            "name": [{"service": f"liir.v1.{name}"} for name in ("CheckpointService", "TrainingService")],
+            "name": [
+                {"service": f"liir.v1.{service}", "method": method}
+                for service, methods in _RETRIED.items()
+                for method in methods
+            ],
             "retryPolicy": {
                 "maxAttempts": 5,
                 "initialBackoff": "0.1s",
@@ -41,8 +50,8 @@ CHANNEL_OPTIONS = (
 )
 
 
-def connect(address: str, timeout_s: float | None = 30.0) -> grpc.Channel:
-    """A channel to the learner at HOST:PORT, once it answers; with no time-out it waits for ever.
+def connect(address: str, timeout_s: float = 30.0) -> grpc.Channel:
+    """A channel to the learner at HOST:PORT, once it answers.
 
     Raises:
         UnreachableError: nobody answered within `timeout_s`.

@@ -11,7 +11,7 @@ import structlog
 from liir_common import checkpoint, metrics, seeds
 from liir_common.client import CheckpointClient
 from liir_common.config import Config
-from liir_common.errors import RefusedError
+from liir_common.errors import RefusedError, UnreachableError
 from liir_common.rollout.player import Player
 from liir_common.rpc.channel import backoffs
 from liir_common.rpc.gen.liir.v1 import checkpoint_pb2
@@ -19,6 +19,7 @@ from liir_common.types import Exploration, Ticket, Weights
 
 log = structlog.get_logger()
 
+_AWAY = (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.DEADLINE_EXCEEDED)
 _MODES = {"greedy": Exploration.GREEDY, "sampled": Exploration.SOFTMAX_FLOOR}
 
 
@@ -63,13 +64,15 @@ class Evaluator:
         waits = backoffs()
         while True:
             try:
-                with CheckpointClient(self._address, timeout_s=None) as client:
+                with CheckpointClient(self._address) as client:
                     self._catch_up(client)
                     return
             except grpc.RpcError as error:
-                if error.code() != grpc.StatusCode.UNAVAILABLE:
+                if error.code() not in _AWAY:
                     raise RefusedError(f"{error.code().name}: {error.details()}") from None
                 log.warning("the learner is away", address=self._address, reason=error.details())
+            except UnreachableError as error:
+                log.warning("the learner is away", address=self._address, reason=str(error))
             time.sleep(next(waits))
 
     def _catch_up(self, client: CheckpointClient) -> None:

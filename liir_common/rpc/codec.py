@@ -163,7 +163,9 @@ def check_playable(trajectory: Trajectory, spec: EnvSpec) -> None:
         raise ValueError("trajectory: wanted terminated or truncated, got neither")
     for name in ("obs", "state", "log_mu", "reward"):
         # A sum is finite only if all its terms are, and costs half of asking each of them.
-        if not math.isfinite(getattr(trajectory, name).sum(dtype=np.float64)):
+        with np.errstate(invalid="ignore"):
+            total = getattr(trajectory, name).sum(dtype=np.float64)
+        if not math.isfinite(total):
             raise ValueError(f"{name}: wanted finite numbers, got NaN or infinity")
     if not all(map(math.isfinite, trajectory.info.values())):
         raise ValueError("info: wanted finite numbers, got NaN or infinity")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import queue
 import time
+from collections.abc import Iterable
 
 import grpc
 import structlog
@@ -45,18 +46,19 @@ class RolloutActor:
             RefusedError: the learner will not have this actor.
         """
         waits = channel.backoffs()
-        while True:
-            try:
-                with grpc.insecure_channel(self._address, options=channel.CHANNEL_OPTIONS) as connection:
-                    if self._serve(rollout_pb2_grpc.RolloutServiceStub(connection)):
+        with grpc.insecure_channel(self._address, options=channel.CHANNEL_OPTIONS) as connection:
+            learner = rollout_pb2_grpc.RolloutServiceStub(connection)
+            while True:
+                try:
+                    if self._serve(learner):
                         return
-                waits = channel.backoffs()
-            except grpc.RpcError as error:
-                if error.code() not in _RETRIED:
-                    raise RefusedError(f"{error.code().name}: {error.details()}") from None
-                log.warning("the learner is away", address=self._address, reason=error.details())
-            # Nothing to keep: whoever gets the tickets next plays the same episodes.
-            time.sleep(next(waits))
+                    waits = channel.backoffs()
+                except grpc.RpcError as error:
+                    if error.code() not in _RETRIED:
+                        raise RefusedError(f"{error.code().name}: {error.details()}") from None
+                    log.warning("the learner is away", address=self._address, reason=error.details())
+                # Nothing to keep: whoever gets the tickets next plays the same episodes.
+                time.sleep(next(waits))
 
     def _serve(self, learner: rollout_pb2_grpc.RolloutServiceStub) -> bool:
         """Play over one stream until it ends; true if the run is complete."""
@@ -67,8 +69,18 @@ class RolloutActor:
         )
         outgoing.put(rollout_pb2.PlayRequest(hello=hello))
         outgoing.put(rollout_pb2.PlayRequest(ready=rollout_pb2.Ready(tickets=self._player.tickets_held)))
+        try:
+            return self._answer(learner.Play(iter(outgoing.get, None), wait_for_ready=True), outgoing)
+        finally:
+            outgoing.put(None)  # ends our side, and the thread in which gRPC reads the queue
+
+    def _answer(
+        self,
+        messages: Iterable[rollout_pb2.PlayResponse],
+        outgoing: queue.SimpleQueue[rollout_pb2.PlayRequest | None],
+    ) -> bool:
         version, idle_since = -1, time.perf_counter()
-        for message in learner.Play(iter(outgoing.get, None), wait_for_ready=True):
+        for message in messages:
             match message.WhichOneof("body"):
                 case "policy":
                     self._player.load(codec.decode_policy(message.policy, self._shapes))
@@ -85,7 +97,6 @@ class RolloutActor:
                     encoded = codec.encode_trajectory(trajectory, stats, self._compress)
                     outgoing.put(rollout_pb2.PlayRequest(trajectory=encoded))
                 case "drain":
-                    outgoing.put(None)
                     log.info("drained", reason=message.drain.reason)
                     return bool(message.drain.run_complete)
         return False

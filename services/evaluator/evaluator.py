@@ -62,18 +62,18 @@ class Evaluator:
             RefusedError: the learner refused a call; to try again would not help.
         """
         waits = backoffs()
-        while True:
-            try:
-                with CheckpointClient(self._address) as client:
+        with CheckpointClient(self._address) as client:  # which connects again by itself
+            while True:
+                try:
                     self._catch_up(client)
                     return
-            except grpc.RpcError as error:
-                if error.code() not in _AWAY:
-                    raise RefusedError(f"{error.code().name}: {error.details()}") from None
-                log.warning("the learner is away", address=self._address, reason=error.details())
-            except UnreachableError as error:
-                log.warning("the learner is away", address=self._address, reason=str(error))
-            time.sleep(next(waits))
+                except grpc.RpcError as error:
+                    if error.code() not in _AWAY:
+                        raise RefusedError(f"{error.code().name}: {error.details()}") from None
+                    log.warning("the learner is away", address=self._address, reason=error.details())
+                except UnreachableError as error:
+                    log.warning("the learner is away", address=self._address, reason=str(error))
+                time.sleep(next(waits))
 
     def _catch_up(self, client: CheckpointClient) -> None:
         tested = {evaluation.episode for evaluation in client.evaluations()}

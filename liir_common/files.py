@@ -19,6 +19,7 @@ def write_atomic(path: Path, data: bytes) -> None:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
+            os.fchmod(file.fileno(), 0o644)  # temporary files are private; other processes read this one
         os.replace(temporary, path)
     except BaseException:
         os.unlink(temporary)

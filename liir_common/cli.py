@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import sys
 import time
@@ -214,6 +215,62 @@ def calibrate(
         print(json.dumps(rows))
     else:
         print("\n".join(format_rows(name, table) for name, table in tables.items()))
+
+
+@bench.command("sim")
+def bench_sim_command(map_name: Map = "3m", as_json: Json = False) -> None:
+    """The simulator alone: uniformly random actions, with observations, states, masks and resets."""
+    from liir_common.battle.bench import bench_sim
+
+    _print_result(bench_sim(map_name), as_json)
+
+
+@bench.command("rollout")
+def bench_rollout_command(map_name: Map = "3m", as_json: Json = False) -> None:
+    """Whole episodes: simulator, policy and sampling."""
+    from liir_common.config import EnvConfig
+    from liir_common.rollout.bench import bench_rollout
+
+    _print_result(bench_rollout(EnvConfig(map=map_name)), as_json)
+
+
+@bench.command("learner")
+def bench_learner_command(
+    map_name: Map = "3m",
+    algorithm: Annotated[str, typer.Option(help="liir or central_v.")] = "liir",
+    steps: Annotated[int, typer.Option(min=2, help="Mean length of the episodes.")] = 25,
+    settings: options.Settings = None,
+    as_json: Json = False,
+) -> None:
+    """Learner steps on synthetic batches, against the time of their matrix products alone."""
+    from liir_common import config
+    from liir_common.rollout.play import env_spec
+
+    chosen = config.load(None, [f"env.map={map_name}", f"algorithm.name={algorithm}", *(settings or ())])
+    bench_learner = importlib.import_module("services.learner.bench").bench_learner
+    _print_result(bench_learner(chosen.algorithm, env_spec(chosen.env), steps=steps), as_json)
+
+
+@bench.command("wire")
+def bench_wire_command(
+    map_name: Map = "3m", streams: Annotated[int, typer.Option(min=1)] = 4, as_json: Json = False
+) -> None:
+    """Episodes from local streams into the learner, without playing or learning."""
+    bench_wire = importlib.import_module("services.learner.bench_wire").bench_wire
+    _print_result(bench_wire(map_name, streams), as_json)
+
+
+@bench.command("train")
+def bench_train_command(
+    map_name: Map = "3m",
+    env_steps: Annotated[int, typer.Option(min=1000)] = 300_000,
+    settings: options.Settings = None,
+    as_json: Json = False,
+) -> None:
+    """The whole service, from the command to the last step."""
+    from liir_common.bench import bench_train
+
+    _print_result(bench_train(map_name, env_steps, settings or ()), as_json)
 
 
 def _print_result(result: dict[str, Any], as_json: bool) -> None:

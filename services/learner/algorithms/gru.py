@@ -46,15 +46,18 @@ def forward(inputs: Tensor, weight: Tensor, bias_n: Tensor, sizes: list[int]) ->
         sizes: how many sequences have a step t; never grows, sums to R
     """
     width = weight.shape[1]
-    weight_rz, weight_n = weight.t().split_with_sizes([2 * width, width], 1)
-    h_all, recurrent_n = inputs.new_empty(2, len(inputs), width)
-    r, z, n = inputs.chunk(3, 1)
+    # Gate n's input stays apart, for r multiplies its recurrent sum alone; one product adds all three sums.
+    n = inputs[:, 2 * width :].clone()
+    inputs[:, 2 * width :] = bias_n
+    rz, recurrent_n = inputs[:, : 2 * width], inputs[:, 2 * width :]
+    r, z = rz.chunk(2, 1)
+    h_all, transposed = torch.empty_like(n), weight.t()
     h = inputs.new_zeros(sizes[0], width)
-    in_steps = (x.split_with_sizes(sizes) for x in (inputs[:, : 2 * width], r, z, n, recurrent_n, h_all))
-    for rz_t, r_t, z_t, n_t, recurrent_t, h_t in zip(*in_steps, strict=True):
+    in_steps = (x.split_with_sizes(sizes) for x in (inputs, rz, r, z, recurrent_n, n, h_all))
+    for sums_t, rz_t, r_t, z_t, recurrent_t, n_t, h_t in zip(*in_steps, strict=True):
         h = h[: len(h_t)]
-        rz_t.addmm_(h, weight_rz).sigmoid_()
-        torch.addmm(bias_n, h, weight_n, out=recurrent_t)
+        sums_t.addmm_(h, transposed)
+        rz_t.sigmoid_()
         n_t.addcmul_(r_t, recurrent_t).tanh_()
         h = torch.lerp(n_t, h, z_t, out=h_t)
     before = zip(h_all.split_with_sizes(sizes), sizes[1:], strict=False)
@@ -81,14 +84,13 @@ def backward(trace: Trace, weight: Tensor, grad_h: Tensor) -> tuple[Tensor, Tens
     `grad_h` [R, H], the gradient by the hidden states, is overwritten.
     """
     sizes, grad_gates = trace.sizes, torch.empty_like(trace.to_gates)
-    grads, z, to_gates, out = (
-        x.split_with_sizes(sizes) for x in (grad_h, trace.z, trace.to_gates, grad_gates)
-    )
-    for t in reversed(range(len(sizes))):
-        torch.mul(grads[t].unsqueeze(1), to_gates[t], out=out[t])
-        if t > 0:
-            grads[t - 1][: sizes[t]].addcmul_(grads[t], z[t]).addmm_(out[t].flatten(1), weight)
     gates = grad_gates.flatten(1)
+    in_steps = (grad_h, grad_h.unsqueeze(1), trace.z, trace.to_gates, grad_gates, gates)
+    h, h_1, z, to_gates, out, out_flat = (x.split_with_sizes(sizes) for x in in_steps)
+    for t in range(len(sizes) - 1, 0, -1):
+        torch.mul(h_1[t], to_gates[t], out=out[t])
+        h[t - 1][: sizes[t]].addcmul_(h[t], z[t]).addmm_(out_flat[t], weight)
+    torch.mul(h_1[0], to_gates[0], out=out[0])
     grad_weight, grad_bias = gates.t() @ trace.previous, gates.sum(0)
     # Gate n's input is not multiplied with r, as its recurrent sum is; the other gates' gradients agree.
     torch.mul(grad_h, trace.to_n, out=grad_gates[:, 2])

@@ -13,7 +13,7 @@ through r_in, exact for every form of advantage.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -53,6 +53,10 @@ class Inner:
     """V_φ [B, T+1, n]"""
     target: Tensor
     """V_φ [B, T+1, n] that returns are built from"""
+    eta: Tensor
+    """Leaf of the graph of r_in; η stays where it is until this step has been judged"""
+    r_in: Tensor
+    """[R], with its graph"""
     before: Evaluation
     """The policy before the step"""
     step: Step
@@ -109,13 +113,12 @@ class Liir(ActorCritic):
     def _improve_policy(self, batch: Batch, data: Data) -> tuple[Inner, Tensor, dict[str, Tensor]]:
         """θ → θ' on the proxy advantage; returns the last step, the proxy returns and figures."""
         value, target = self._phi.values(data)
-        with torch.no_grad():
-            r_in = self._intrinsic_reward(self._eta, data)
-            proxy_return = self._proxy_return(data, r_in, target)
-            a_proxy = self._advantage(data, proxy_return, value)
+        eta, r_in = self._intrinsic_reward(data)
+        proxy_return = self._proxy_return(data, r_in.detach(), target)
+        a_proxy = self._advantage(data, proxy_return, value)
         before, step, metrics = self._policy.advance(data, a_proxy)
-        metrics |= self._reward_figures(data, r_in)
-        return Inner(batch, data, value, target, before, step), proxy_return, metrics
+        metrics |= self._reward_figures(data, r_in.detach())
+        return Inner(batch, data, value, target, eta, r_in, before, step), proxy_return, metrics
 
     def _improve_reward(self, inner: Inner, judged: Data, a_ex: Tensor) -> dict[str, Tensor]:
         """η ascends ∇η J_ex, the extrinsic return at θ' being judged by the advantage `a_ex` of `judged`."""
@@ -123,12 +126,11 @@ class Liir(ActorCritic):
         v = self._policy.extrinsic_gradient(judged, a_ex)  # Eq. (8)
         c = self._policy.derivative(inner.before, data, inner.step.transpose(v))
 
-        eta = self._eta.detach().requires_grad_()
-        proxy_return = self._proxy_return(data, self._intrinsic_reward(eta, data), inner.target)
+        proxy_return = self._proxy_return(data, inner.r_in, inner.target)
         a_proxy = self._advantage(data, proxy_return, inner.value)
         # Eq. (9): g is linear in the weights of ∇log π, and those in A_proxy.
         s = data.mean(c * self._policy.score_weight(inner.before, data, a_proxy))
-        (gradient,) = torch.autograd.grad(s, eta)  # Eq. (7)
+        (gradient,) = torch.autograd.grad(s, inner.eta)  # Eq. (7)
         self._eta_optimizer.ascend(gradient)
         return {
             "eta_gradient_norm": torch.linalg.vector_norm(gradient),
@@ -136,9 +138,10 @@ class Liir(ActorCritic):
             "credit_std": (data.mean(c**2) - data.mean(c) ** 2).clamp_min(0).sqrt(),
         }
 
-    def _intrinsic_reward(self, eta: Tensor, data: Data) -> Tensor:
-        """r_in(η; s_i, u_i) [R] of the living; the dead get none."""
-        return data.weight * self._reward(eta, data.local).gather(1, data.actions.t()).squeeze(1)
+    def _intrinsic_reward(self, data: Data) -> tuple[Tensor, Tensor]:
+        """A leaf η and r_in(η; s_i, u_i) [R] of the living; the dead get none."""
+        eta = self._eta.detach().requires_grad_(self._learns_reward)
+        return eta, data.weight * self._reward(eta, data.local).gather(1, data.actions.t()).squeeze(1)
 
     def _proxy_return(self, data: Data, r_in: Tensor, target: Tensor) -> Tensor:
         r_proxy = data.reward + self._config.lambda_ * data.lives(r_in)  # Eq. (2)
@@ -178,6 +181,9 @@ class Liir(ActorCritic):
         pending = {k: v for k, v in state.items() if fresh and k.startswith("pending.")}
         inner = self._unpack({k.removeprefix("pending."): v for k, v in pending.items()}) if pending else None
         super().load_state({k: v for k, v in state.items() if k not in pending})
+        if inner:  # Only now is η the one that its r_in came from.
+            eta, r_in = self._intrinsic_reward(inner.data)
+            inner = replace(inner, eta=eta, r_in=r_in)
         self._pending = inner
 
     def _tensors(self) -> dict[str, Tensor]:
@@ -195,7 +201,8 @@ class Liir(ActorCritic):
         value, target, theta, gradient, diagonal = (tensors[name].to(self._device) for name in _STEP)
         step = Step(gradient, diagonal, self._config.policy_optimizer.clip)
         data = self._prepare(batch)
-        return Inner(batch, data, value, target, self._policy.evaluate(theta, data), step)
+        eta, r_in = self._intrinsic_reward(data)
+        return Inner(batch, data, value, target, eta, r_in, self._policy.evaluate(theta, data), step)
 
 
 _BATCH = [field.name for field in fields(Batch)]

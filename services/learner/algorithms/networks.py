@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Mapping
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -84,8 +84,8 @@ class Mlp:
 
     def __call__(self, flat: Tensor, x: Tensor) -> Tensor:
         """Outputs [..., outputs] for inputs [..., inputs]."""
-        p = views(flat, self.shapes)
-        return _above(p, functional.linear(x, p["fc1.weight"], p["fc1.bias"]))
+        w1, b1, *above = views(flat, self.shapes).values()
+        return _above(functional.linear(x, w1, b1), *above)
 
 
 class StateValue(Mlp):
@@ -107,13 +107,11 @@ class AgentValue(Mlp):
 
     def __call__(self, flat: Tensor, x: Tensor) -> Tensor:
         """Values [M, n] of states [M, S]."""
-        p = views(flat, self.shapes)
-        of_state, of_id = p["fc1.weight"].split_with_sizes(
-            [x.shape[1], p["fc1.weight"].shape[1] - x.shape[1]], 1
-        )
+        w1, b1, *above = views(flat, self.shapes).values()
+        of_state, of_id = w1.split_with_sizes([x.shape[1], w1.shape[1] - x.shape[1]], 1)
         # The state's part of the first layer is the same for all agents of a step.
-        first = functional.linear(x, of_state, p["fc1.bias"]).unsqueeze(1) + of_id.t().contiguous()
-        return _above(p, first).squeeze(-1)
+        first = functional.linear(x, of_state, b1).unsqueeze(1) + of_id.t().contiguous()
+        return _above(first.flatten(0, 1), *above).view(first.shape[:2])
 
 
 class IntrinsicReward(Mlp):
@@ -128,10 +126,26 @@ class IntrinsicReward(Mlp):
         return self._bound * torch.tanh(super().__call__(flat, x) / self._bound)
 
 
-def _above(p: Mapping[str, Tensor], first: Tensor) -> Tensor:
-    """The layers above the first, whose outputs before the ReLU are overwritten."""
-    hidden = functional.linear(first.relu_(), p["fc2.weight"], p["fc2.bias"]).relu_()
-    return functional.linear(hidden, p["fc3.weight"], p["fc3.bias"])
+class _Above(torch.autograd.Function):
+    """The layers above the first, from its outputs [M, H] before the ReLU; written out because autograd's
+    own ReLUs cost as much as the matrix products."""
+
+    @staticmethod
+    def forward(ctx: Any, first: Tensor, w2: Tensor, b2: Tensor, w3: Tensor, b3: Tensor) -> Tensor:
+        h1 = first.relu()
+        h2 = functional.linear(h1, w2, b2).relu_()
+        ctx.save_for_backward(h1, h2, w2, w3)
+        return functional.linear(h2, w3, b3)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, ...]:
+        h1, h2, w2, w3 = ctx.saved_tensors
+        by_h2 = torch.ops.aten.threshold_backward(grad @ w3, h2, 0)
+        by_h1 = torch.ops.aten.threshold_backward(by_h2 @ w2, h1, 0)
+        return by_h1, by_h2.t() @ h1, by_h2.sum(0), grad.t() @ h2, grad.sum(0)
+
+
+_above: Callable[..., Tensor] = _Above.apply
 
 
 def coma_critic_size(spec: EnvSpec) -> int:

@@ -188,6 +188,40 @@ def report(
 
 
 @app.command()
+def replay(
+    checkpoint: Annotated[
+        Path | None, typer.Option("--checkpoint", help="Checkpoint file, its manifest beside it.")
+    ] = None,
+    run_dir: Annotated[
+        Path | None, typer.Option("--run-dir", help="Run directory; its latest checkpoint plays.")
+    ] = None,
+    best: Annotated[bool, typer.Option("--best", help="With --run-dir: the one with most wins.")] = False,
+    map_name: Annotated[
+        str | None, typer.Option("--map", help="Battle map; that of the training if absent.")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Seed of the battle.")] = 0,
+    sampled: Annotated[bool, typer.Option("--sampled", help="Draw actions from the policy.")] = False,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help=".html to explore; .gif or .mp4 to watch.")
+    ] = Path("battle.html"),
+) -> None:
+    """Show one battle of a frozen policy, with its probabilities and the intrinsic reward it learned."""
+    from liir_common.replay.load import find_checkpoint, load_checkpoint
+    from liir_common.replay.record import record
+    from liir_common.replay.write import check_output, write
+    from liir_common.types import Exploration
+
+    check_output(output)
+    manifest, tensors = load_checkpoint(find_checkpoint(checkpoint, run_dir, best))
+    exploration = Exploration.SOFTMAX_FLOOR if sampled else Exploration.GREEDY
+    recording = record(manifest, tensors, seed, exploration, map_name)
+    write(recording, output)
+    trajectory = recording.trajectory
+    result = "won" if trajectory.info["won"] else "not won"
+    print(f"{output}: {recording.map_name}, {result} after {trajectory.length} steps")
+
+
+@app.command()
 def calibrate(
     map_name: Annotated[
         str | None, typer.Option("--map", help="One map; all with targets if absent.")

@@ -81,7 +81,7 @@ class BattleEnv(ParallelEnv[str, Observation, np.int64]):
 
     metadata: dict[str, Any] = {  # noqa: RUF012  # PettingZoo declares it so
         "name": "battle_v1",
-        "render_modes": ["ansi", "rgb_array"],
+        "render_modes": ["human", "ansi", "rgb_array"],
         "render_fps": 2.8,
         "is_parallelizable": True,
     }
@@ -259,11 +259,13 @@ class BattleEnv(ParallelEnv[str, Observation, np.int64]):
         unit["attacker"] = unit["missile_target"] = -1
 
     def render(self) -> str | NDArray[np.uint8] | None:
-        """The battlefield as text ("ansi") or as an image [H, W, 3] ("rgb_array")."""
+        """The battlefield as text ("ansi"), printed ("human") or as an image [H, W, 3] ("rgb_array")."""
         if self.render_mode == "ansi":
             return draw_ansi(self.snapshot(), self._tables.pathing)
         if self.render_mode == "rgb_array":
             return draw_rgb(self.snapshot(), self._tables.pathing)
+        if self.render_mode == "human":
+            print(draw_ansi(self.snapshot(), self._tables.pathing))
         return None
 
     def _observe(self) -> None:
@@ -291,7 +293,7 @@ def parallel_env(map_name: str, render_mode: str | None = None, **options: Any) 
 
     Args:
         map_name: one of `scenarios.SCENARIOS`.
-        render_mode: None, "ansi" or "rgb_array".
+        render_mode: None, "human", "ansi" or "rgb_array".
         options: fields of `parameters.Settings`.
 
     Raises:

@@ -1,0 +1,83 @@
+"""A recording as a GIF or an MP4, at the speed at which the game is played."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from fractions import Fraction
+
+import numpy as np
+
+from liir_common.battle.engine import LOOPS_PER_STEP
+from liir_common.battle.env import BattleEnv, UnitRecord
+from liir_common.battle.render import Image, draw_rgb
+from liir_common.errors import ConfigError
+from liir_common.replay.record import Frame, Recording
+
+_STEPS_PER_SECOND: float = BattleEnv.metadata["render_fps"]
+_SHOT = 0.5
+"""Share of a step in which its shots are seen"""
+_LAST_SECONDS = 1.5
+"""How long the end is shown"""
+
+
+def write_gif(recording: Recording) -> bytes:
+    """An endless GIF with a frame for every second game loop.
+
+    Raises:
+        ConfigError: Pillow is not installed.
+    """
+    try:
+        from PIL import Image as pillow
+    except ImportError:
+        raise ConfigError('a GIF wants Pillow: pip install "liir-service[animation]"') from None
+    per_step = LOOPS_PER_STEP // 2
+    frames = [pillow.fromarray(image) for image in draw_frames(recording, per_step)]
+    milliseconds = [round(1000 / (_STEPS_PER_SECOND * per_step))] * len(frames)
+    milliseconds[-1] = round(1000 * _LAST_SECONDS)
+    file = io.BytesIO()
+    frames[0].save(file, "GIF", save_all=True, append_images=frames[1:], duration=milliseconds, loop=0)
+    return file.getvalue()
+
+
+def write_mp4(recording: Recording) -> bytes:
+    """An H.264 video with a frame for every game loop.
+
+    Raises:
+        ConfigError: PyAV is not installed.
+    """
+    try:
+        import av
+    except ImportError:
+        raise ConfigError('an MP4 wants PyAV: pip install "liir-service[animation]"') from None
+    rate = Fraction(_STEPS_PER_SECOND * LOOPS_PER_STEP).limit_denominator(10)
+    images = list(draw_frames(recording, LOOPS_PER_STEP))
+    images += images[-1:] * round(_LAST_SECONDS * rate)
+    file = io.BytesIO()
+    with av.open(file, "w", format="mp4") as container:
+        stream = container.add_stream("libx264", rate, options={"crf": "20"})
+        stream.height, stream.width = images[0].shape[:2]
+        stream.pix_fmt = "yuv420p"  # the one that every player knows
+        for image in images:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image)))
+        container.mux(stream.encode())
+    return file.getvalue()
+
+
+def draw_frames(recording: Recording, per_step: int) -> Iterator[Image]:
+    """Images [H, W, 3], `per_step` of each step and one of the end; units glide between their records."""
+    for before, after, shots in zip(recording.frames, recording.frames[1:], recording.shots, strict=False):
+        for share in np.arange(per_step) / per_step:
+            yield draw_rgb(_between(before, after, share), recording.pathing, shots if share < _SHOT else ())
+    yield draw_rgb(recording.frames[-1], recording.pathing)
+
+
+def _between(before: Frame, after: Frame, share: float) -> list[UnitRecord]:
+    return [_mix(old, new, share) for old, new in zip(before, after, strict=True)]
+
+
+def _mix(old: UnitRecord, new: UnitRecord, share: float) -> UnitRecord:
+    unit = old.copy()
+    for key in ("x", "y", "health", "shield"):
+        unit[key] += share * (new[key] - old[key])
+    return unit

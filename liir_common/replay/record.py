@@ -1,0 +1,163 @@
+"""Play one battle with a frozen policy and keep all there is to see: the units, what the policy weighed at
+every decision, and the intrinsic reward of every action it could have taken."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liir_common import checkpoint
+from liir_common.battle.engine import LOOPS_PER_STEP
+from liir_common.battle.env import BattleEnv, UnitRecord
+from liir_common.battle.render import Shot
+from liir_common.battle.scenarios import TERRAINS, find_scenario
+from liir_common.battle.tables import FIRST_ATTACK
+from liir_common.checkpoint import Manifest
+from liir_common.config import EnvConfig
+from liir_common.errors import ConfigError
+from liir_common.intrinsic import IntrinsicReward
+from liir_common.rollout.loop import LoopPlayer
+from liir_common.rollout.play import env_spec
+from liir_common.rollout.policy import MODES, Choice, act, pack
+from liir_common.types import EnvSpec, Exploration, FloatArray, IntArray, Ticket, Trajectory, Weights
+
+Frame = Sequence[UnitRecord]
+"""All units at one moment, allies first"""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One battle of T steps, with n agents and A actions."""
+
+    map_name: str
+    seed: int
+    exploration: Exploration
+    manifest: Manifest
+    """Of the checkpoint that played"""
+    pathing: NDArray[np.bool_]
+    """[32, 32] by (x, y), true where ground units can stand"""
+    frames: Sequence[Frame]
+    """T + 1 of them, as `Trajectory` has observations"""
+    shots: Sequence[Sequence[Shot]]
+    """T of them: the attacks that began within each step"""
+    trajectory: Trajectory
+    probabilities: FloatArray
+    """[T, n, A], softmax over the available actions, however the action was chosen"""
+    intrinsic: FloatArray | None
+    """[T, n, A], r_in of every action; None where the method learns none"""
+
+
+def record(
+    manifest: Manifest,
+    tensors: Weights,
+    seed: int = 0,
+    exploration: Exploration = Exploration.GREEDY,
+    map_name: str | None = None,
+) -> Recording:
+    """Play the battle that `env.reset(seed)` begins.
+
+    Args:
+        manifest, tensors: a checkpoint, as `load_checkpoint` returns it.
+        seed: 64 bits, for the battle and for what is drawn from the policy.
+        exploration: GREEDY, or SOFTMAX_FLOOR to draw from the policy.
+        map_name: another map than that of the training, with the same sizes.
+
+    Raises:
+        ConfigError: the policy does not play battles, the map is unknown or does not fit the policy, or the
+            seed is out of range.
+    """
+    env = EnvConfig.model_validate(manifest.config["env"])
+    if env.kind != "battle":
+        raise ConfigError(f"a replay wants a policy that plays battles, got one for {env.factory}")
+    if not 0 <= seed < 2**64:
+        raise ConfigError(f"a seed wants an integer in [0, 2**64), got {seed}")
+    map_name = map_name or env.map
+    options: dict[str, Any] = dict(env.options)
+    spec, weights = env_spec(env.model_copy(update={"map": map_name})), checkpoint.section(tensors, "policy")
+    battle = _WatchedBattle(map_name, **options)
+    player = LoopPlayer(battle, spec, len(weights["fc1.bias"]))
+    try:
+        player.load(weights)
+    except ValueError as error:
+        raise ConfigError(f"{map_name} does not fit a policy trained on {env.map}: {error}") from None
+    trajectory = player.play(Ticket(0, manifest.policy_version, seed, exploration, epsilon=0.0))
+    return Recording(
+        map_name=map_name,
+        seed=seed,
+        exploration=exploration,
+        manifest=manifest,
+        pathing=TERRAINS[find_scenario(map_name).terrain],
+        frames=battle.frames,
+        shots=list(map(find_shots, battle.frames[:-1], battle.frames[1:], trajectory.actions)),
+        trajectory=trajectory,
+        probabilities=policy_probabilities(weights, spec, trajectory),
+        intrinsic=_intrinsic(manifest, tensors, trajectory),
+    )
+
+
+class _WatchedBattle(BattleEnv):
+    """A battle that remembers how all units stood before each step and after the last."""
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        result = super().reset(seed, options)
+        self.frames = [self.snapshot()]
+        return result
+
+    def step(self, actions: dict[str, Any]) -> Any:
+        result = super().step(actions)
+        self.frames.append(self.snapshot())
+        return result
+
+
+def policy_probabilities(weights: Weights, spec: EnvSpec, trajectory: Trajectory) -> FloatArray:
+    """[T, n, A], the softmax policy's probability of every action along an episode; 0 where unavailable."""
+    hidden = np.zeros((spec.n_agents, len(weights["fc1.bias"])), np.float32)
+    policy = pack(weights, spec, hidden.shape[1])
+    choice = Choice(np.zeros(1, np.uint64), MODES[Exploration.GREEDY], 0.0)
+    last, chosen = np.full(spec.n_agents, -1), np.zeros(spec.n_agents, np.int64)
+    log_mu = np.zeros(spec.n_agents, np.float32)
+    probabilities = np.zeros(trajectory.mask[:-1].shape, np.float32)
+    for t in range(trajectory.length):
+        mask = trajectory.mask[t]
+        act(policy, hidden, trajectory.obs[t], last, mask, choice, chosen, log_mu)
+        logits = np.where(mask, policy.logits, -np.inf)
+        exponentials = np.exp(logits - logits.max(-1, keepdims=True))
+        probabilities[t] = exponentials / exponentials.sum(-1, keepdims=True)
+        # What was done, not what this pass would have chosen, is what the policy sees next.
+        last[:] = trajectory.actions[t]
+    return probabilities
+
+
+def _intrinsic(manifest: Manifest, tensors: Weights, trajectory: Trajectory) -> FloatArray | None:
+    if not checkpoint.section(tensors, "intrinsic"):
+        return None
+    return IntrinsicReward.from_checkpoint(manifest, tensors)(trajectory.obs[:-1])
+
+
+def find_shots(before: Frame, after: Frame, actions: IntArray) -> list[Shot]:
+    """Attacks that began in the step between two frames in which `actions` [n] were ordered.
+
+    An attack sets the weapon's cooldown, which otherwise only falls; its target is the one ordered, else
+    the one that the unit has or had.
+    """
+    n = len(actions)
+    ordered = [n + int(action) - FIRST_ATTACK if action >= FIRST_ATTACK else None for action in actions]
+    shots = []
+    for i, (old, new) in enumerate(zip(before, after, strict=True)):
+        if new["cooldown"] > max(0.0, old["cooldown"] - LOOPS_PER_STEP):
+            targets = (ordered[i] if i < n else None, target_number(new, n), target_number(old, n))
+            target = next((target for target in targets if target is not None), None)
+            if target is not None:
+                shots.append(Shot(i, target))
+    return shots
+
+
+def target_number(unit: UnitRecord, n_allies: int) -> int | None:
+    """Place in the frame of the unit that `unit` has as its target."""
+    if unit["target"] is None:
+        return None
+    return unit["target"] + n_allies if unit["team"] == "ally" else unit["target"]

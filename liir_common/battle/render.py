@@ -24,7 +24,7 @@ LETTERS = {
 """What each unit type is called where there is room for one letter."""
 _GROUND, _VOID = (52, 60, 52), (20, 22, 24)
 _COLOURS = {"ally": (86, 156, 214), "enemy": (209, 84, 78)}
-_TRACER = (255, 226, 150)
+_TRACER, _LIFE, _SHIELD = (255, 226, 150), (96, 200, 120), (120, 190, 255)
 
 Units = Sequence[Mapping[str, Any]]
 """Records as `BattleEnv.snapshot` returns them"""
@@ -53,21 +53,27 @@ def draw_ansi(units: Units, pathing: NDArray[np.bool_]) -> str:
     return "\n".join("".join(row) for row in reversed(rows)) + "\n" + bars
 
 
-def draw_rgb(units: Units, pathing: NDArray[np.bool_], shots: Sequence[Shot] = ()) -> Image:
-    """Image [H, W, 3], north up; a disc is as bright as its unit is whole."""
+def draw_rgb(
+    units: Units, pathing: NDArray[np.bool_], shots: Sequence[Shot] = (), scale: int = PIXELS_PER_CELL
+) -> Image:
+    """Image [H, W, 3] with `scale` pixels per cell, north up.
+
+    A disc is as bright as its unit is whole; the bars above it are life and shield.
+    """
     cells = np.where(pathing.T[::-1, :, None], _GROUND, _VOID).astype(np.uint8)
-    image = cells.repeat(PIXELS_PER_CELL, axis=0).repeat(PIXELS_PER_CELL, axis=1)
-    for unit in units:
-        if unit["alive"]:
-            _draw_disc(image, unit)
+    image = cells.repeat(scale, axis=0).repeat(scale, axis=1)
+    alive = [unit for unit in units if unit["alive"]]
+    for unit in alive:
+        _draw_disc(image, unit, scale)
     for shot in shots:
-        _draw_line(image, units[shot.attacker], units[shot.target])
+        _draw_line(image, units[shot.attacker], units[shot.target], scale)
+    for unit in alive:
+        _draw_bars(image, unit, scale)
     return image
 
 
-def _draw_disc(image: Image, unit: Mapping[str, Any]) -> None:
-    row, column = _pixel(image, unit)
-    radius = unit["radius"] * PIXELS_PER_CELL
+def _draw_disc(image: Image, unit: Mapping[str, Any], scale: int) -> None:
+    (row, column), radius = _pixel(image, unit, scale), unit["radius"] * scale
     top, left = max(0, int(row - radius) - 1), max(0, int(column - radius) - 1)
     window = image[top : int(row + radius) + 2, left : int(column + radius) + 2]
     rows, columns = np.indices(window.shape[:2])
@@ -78,13 +84,25 @@ def _draw_disc(image: Image, unit: Mapping[str, Any]) -> None:
     window[:] = cover * colour + (1 - cover) * window
 
 
-def _draw_line(image: Image, start: Mapping[str, Any], end: Mapping[str, Any]) -> None:
-    a, b = np.array(_pixel(image, start)), np.array(_pixel(image, end))
+def _draw_bars(image: Image, unit: Mapping[str, Any], scale: int) -> None:
+    (row, column), radius = _pixel(image, unit, scale), unit["radius"] * scale
+    thick, width = max(2, scale // 8), int(2 * radius)
+    top, left = int(row - radius) - thick, max(0, int(column - radius))
+    for name, colour in (("health", _LIFE), ("shield", _SHIELD)):
+        if unit[f"{name}_max"]:
+            top -= thick
+            bar = image[max(0, top) : max(0, top + thick - 1), left : left + width]
+            bar[:] = _VOID
+            bar[:, : round(width * unit[name] / unit[f"{name}_max"])] = colour
+
+
+def _draw_line(image: Image, start: Mapping[str, Any], end: Mapping[str, Any], scale: int) -> None:
+    a, b = np.array(_pixel(image, start, scale)), np.array(_pixel(image, end, scale))
     along = np.linspace(0, 1, 1 + int(np.abs(b - a).max()))[:, None]
     rows, columns = np.clip((a + along * (b - a)).astype(int), 0, np.array(image.shape[:2]) - 1).T
     image[rows, columns] = _TRACER
 
 
-def _pixel(image: Image, unit: Mapping[str, Any]) -> tuple[float, float]:
+def _pixel(image: Image, unit: Mapping[str, Any], scale: int) -> tuple[float, float]:
     """Row and column of a unit's centre."""
-    return len(image) - unit["y"] * PIXELS_PER_CELL, unit["x"] * PIXELS_PER_CELL
+    return len(image) - unit["y"] * scale, unit["x"] * scale

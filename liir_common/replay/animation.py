@@ -15,6 +15,8 @@ from liir_common.errors import ConfigError
 from liir_common.replay.record import Frame, Recording
 
 _STEPS_PER_SECOND: float = BattleEnv.metadata["render_fps"]
+_SCALE = 24
+"""Pixels per cell; even, since H.264 wants even sizes"""
 _SHOT = 0.5
 """Share of a step in which its shots are seen"""
 _LAST_SECONDS = 1.5
@@ -33,7 +35,7 @@ def write_gif(recording: Recording) -> bytes:
         raise ConfigError('a GIF wants Pillow: pip install "liir-service[animation]"') from None
     per_step = LOOPS_PER_STEP // 2
     frames = [pillow.fromarray(image) for image in draw_frames(recording, per_step)]
-    milliseconds = [round(1000 / (_STEPS_PER_SECOND * per_step))] * len(frames)
+    milliseconds = [10 * round(100 / (_STEPS_PER_SECOND * per_step))] * len(frames)  # a GIF counts in 10 ms
     milliseconds[-1] = round(1000 * _LAST_SECONDS)
     file = io.BytesIO()
     frames[0].save(file, "GIF", save_all=True, append_images=frames[1:], duration=milliseconds, loop=0)
@@ -59,17 +61,27 @@ def write_mp4(recording: Recording) -> bytes:
         stream.height, stream.width = images[0].shape[:2]
         stream.pix_fmt = "yuv420p"  # the one that every player knows
         for image in images:
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(image)))
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(image))))
         container.mux(stream.encode())
     return file.getvalue()
 
 
 def draw_frames(recording: Recording, per_step: int) -> Iterator[Image]:
-    """Images [H, W, 3], `per_step` of each step and one of the end; units glide between their records."""
+    """Images [H, W, 3] of the ground, `per_step` of each step and one of the end.
+
+    Units glide between the places where they were recorded.
+    """
+    pathing = recording.pathing
+    columns, rows = (np.flatnonzero(pathing.any(axis)) for axis in (1, 0))
+    ground = (
+        slice((len(pathing.T) - 1 - rows[-1]) * _SCALE, (len(pathing.T) - rows[0]) * _SCALE),
+        slice(columns[0] * _SCALE, (columns[-1] + 1) * _SCALE),
+    )
     for before, after, shots in zip(recording.frames, recording.frames[1:], recording.shots, strict=False):
         for share in np.arange(per_step) / per_step:
-            yield draw_rgb(_between(before, after, share), recording.pathing, shots if share < _SHOT else ())
-    yield draw_rgb(recording.frames[-1], recording.pathing)
+            seen = shots if share < _SHOT else ()
+            yield draw_rgb(_between(before, after, share), pathing, seen, _SCALE)[ground]
+    yield draw_rgb(recording.frames[-1], pathing, scale=_SCALE)[ground]
 
 
 def _between(before: Frame, after: Frame, share: float) -> list[UnitRecord]:

@@ -7,13 +7,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pettingzoo.test import parallel_api_test, parallel_seed_test
+from pettingzoo.test import parallel_api_test, parallel_seed_test, render_test
+from pettingzoo.utils.conversions import parallel_to_aec
 
 from liir_common.battle.bench import bench_sim
 from liir_common.battle.calibrate import calibrate
 from liir_common.battle.engine import SIMULATOR_VERSION
 from liir_common.battle.env import BattleEnv, battle_spec, parallel_env
-from liir_common.battle.scenarios import SCENARIOS, make_battle
+from liir_common.battle.render import LETTERS, Shot, draw_rgb
+from liir_common.battle.scenarios import SCENARIOS, TERRAINS, make_battle
+from liir_common.battle.units import UNIT_TYPES
 
 
 @pytest.mark.filterwarnings("error")
@@ -190,7 +193,41 @@ def test_render() -> None:
     assert tuple(image[256, int(env.snapshot()[5]["x"] * 16)]) == (209, 84, 78)
     assert parallel_env("3m").render() is None
     with pytest.raises(ValueError, match="render_mode wants one of"):
-        parallel_env("3m", render_mode="human")
+        parallel_env("3m", render_mode="vector")
+
+
+@pytest.mark.parametrize("map_name", SCENARIOS)
+def test_pettingzoo_render(map_name: str) -> None:
+    render_test(lambda render_mode: parallel_to_aec(parallel_env(map_name, render_mode)))
+
+
+def test_human_rendering_prints_the_battlefield(capsys: pytest.CaptureFixture[str]) -> None:
+    env = parallel_env("3m", render_mode="human")
+    env.reset(seed=1)
+    assert env.render() is None
+    assert capsys.readouterr().out.strip().endswith("enemy 2  marine         45.0    0.0")
+
+
+def test_bars_and_shots_are_drawn() -> None:
+    env = parallel_env("2s3z", render_mode="rgb_array")
+    env.reset(seed=1)
+    units = env.snapshot()
+    whole = draw_rgb(units, TERRAINS["lane"])
+    units[0]["shield"] /= 2
+    units[0]["health"] /= 2
+    half = draw_rgb(units, TERRAINS["lane"])
+    for colour in ((96, 200, 120), (120, 190, 255)):
+        assert (whole == colour).all(-1).sum() - (half == colour).all(-1).sum() == 10, "half of one bar"
+    shot = draw_rgb(units, TERRAINS["lane"], [Shot(0, 5)])
+    changed = np.argwhere((shot != half).any(-1))
+    assert changed[:, 1].min() >= 9 * 16 - 1
+    assert changed[:, 1].max() <= units[5]["x"] * 16
+    assert len(changed) > 150
+
+
+def test_unit_types_have_letters_of_their_own() -> None:
+    assert set(LETTERS) >= set(UNIT_TYPES)
+    assert len(set(LETTERS.values())) == len(LETTERS)
 
 
 def test_bench_and_calibration_measure() -> None:

@@ -21,8 +21,15 @@ setup: $(VENV)/.installed ## Create .venv with the pinned requirements
 train: setup ## Train LIIR on 3m (ARGS="--set seed=7" adds settings)
 	$(BIN)/liir train --config configs/3m.yaml $(ARGS)
 
-test: setup ## Run every test
+test: setup browser ## Run every test
 	$(BIN)/pytest $(ARGS)
+
+# From the system where root may, else the build that playwright downloads.
+browser: setup ## Install Chromium, which the tests of the replay page want
+	@for name in chromium chromium-browser google-chrome; do command -v $$name >/dev/null && exit; done; \
+	if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; \
+	then apt-get update -qq && apt-get install -y -qq --no-install-recommends chromium; \
+	else $(BIN)/playwright install chromium; fi
 
 lint: setup ## Check style, types, import rules and generated code
 	$(BIN)/ruff check .
@@ -44,4 +51,4 @@ proto: setup ## Generate the gRPC code from proto/
 proto-check: proto
 	git diff --exit-code -- $(GEN)
 
-.PHONY: help setup train test lint proto proto-check
+.PHONY: help setup train test browser lint proto proto-check

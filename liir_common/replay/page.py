@@ -10,13 +10,11 @@ import numpy as np
 
 from liir_common.battle.env import BattleEnv, UnitRecord
 from liir_common.battle.render import LETTERS
-from liir_common.replay.record import Recording, target_number
+from liir_common.replay.record import HEALERS, Recording, target_number
 from liir_common.types import Exploration
 
 _ACTIONS = ("no-op", "stop", "north", "south", "east", "west")
 """Those below the attacks"""
-_HEALERS = ("medivac",)
-"""Their attack actions heal allies."""
 _PLACE = "/*RECORDING*/null"
 
 
@@ -71,7 +69,7 @@ def _unit(unit: UnitRecord) -> dict[str, Any]:
         "radius": unit["radius"],
         "health": unit["health_max"],
         "shield": unit["shield_max"],
-        "verb": "heal ally" if unit["unit_type"] in _HEALERS else "attack enemy",
+        "verb": "heal ally" if unit["unit_type"] in HEALERS else "attack enemy",
     }
 
 

@@ -14,7 +14,7 @@ from liir_common import checkpoint
 from liir_common.battle.engine import LOOPS_PER_STEP
 from liir_common.battle.env import BattleEnv, UnitRecord
 from liir_common.battle.render import Shot
-from liir_common.battle.scenarios import TERRAINS, find_scenario
+from liir_common.battle.scenarios import make_battle
 from liir_common.battle.tables import FIRST_ATTACK
 from liir_common.checkpoint import Manifest
 from liir_common.config import EnvConfig
@@ -25,6 +25,8 @@ from liir_common.rollout.play import env_spec
 from liir_common.rollout.policy import MODES, Choice, act, pack
 from liir_common.types import EnvSpec, Exploration, FloatArray, IntArray, Ticket, Trajectory, Weights
 
+HEALERS = ("medivac",)
+"""Unit types whose targets are their friends"""
 Frame = Sequence[UnitRecord]
 """All units at one moment, allies first"""
 
@@ -90,7 +92,7 @@ def record(
         seed=seed,
         exploration=exploration,
         manifest=manifest,
-        pathing=TERRAINS[find_scenario(map_name).terrain],
+        pathing=make_battle(map_name, **options)[0].pathing,
         frames=battle.frames,
         shots=list(map(find_shots, battle.frames[:-1], battle.frames[1:], trajectory.actions)),
         trajectory=trajectory,
@@ -157,7 +159,8 @@ def find_shots(before: Frame, after: Frame, actions: IntArray) -> list[Shot]:
 
 
 def target_number(unit: UnitRecord, n_allies: int) -> int | None:
-    """Place in the frame of the unit that `unit` has as its target."""
+    """Place in the frame of the unit that `unit` attacks or heals."""
     if unit["target"] is None:
         return None
-    return unit["target"] + n_allies if unit["team"] == "ally" else unit["target"]
+    aims_at_enemies = (unit["team"] == "ally") != (unit["unit_type"] in HEALERS)
+    return unit["target"] + n_allies if aims_at_enemies else unit["target"]

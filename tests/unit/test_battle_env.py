@@ -15,7 +15,7 @@ from liir_common.battle.calibrate import calibrate
 from liir_common.battle.engine import SIMULATOR_VERSION
 from liir_common.battle.env import BattleEnv, battle_spec, parallel_env
 from liir_common.battle.render import LETTERS, Shot, draw_rgb
-from liir_common.battle.scenarios import SCENARIOS, TERRAINS, make_battle
+from liir_common.battle.scenarios import SCENARIOS, make_battle
 from liir_common.battle.units import UNIT_TYPES
 
 
@@ -212,13 +212,14 @@ def test_bars_and_shots_are_drawn() -> None:
     env = parallel_env("2s3z", render_mode="rgb_array")
     env.reset(seed=1)
     units = env.snapshot()
-    whole = draw_rgb(units, TERRAINS["lane"])
+    pathing = make_battle("2s3z")[0].pathing
+    whole = draw_rgb(units, pathing)
     units[0]["shield"] /= 2
     units[0]["health"] /= 2
-    half = draw_rgb(units, TERRAINS["lane"])
+    half = draw_rgb(units, pathing)
     for colour in ((96, 200, 120), (120, 190, 255)):
         assert (whole == colour).all(-1).sum() - (half == colour).all(-1).sum() == 10, "half of one bar"
-    shot = draw_rgb(units, TERRAINS["lane"], [Shot(0, 5)])
+    shot = draw_rgb(units, pathing, [Shot(0, 5)])
     changed = np.argwhere((shot != half).any(-1))
     assert changed[:, 1].min() >= 9 * 16 - 1
     assert changed[:, 1].max() <= units[5]["x"] * 16

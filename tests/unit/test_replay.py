@@ -22,7 +22,7 @@ from liir_common.cli import app
 from liir_common.errors import ConfigError, CorruptError
 from liir_common.replay.load import find_checkpoint, load_checkpoint
 from liir_common.replay.page import page_data, write_page
-from liir_common.replay.record import Recording, record
+from liir_common.replay.record import Recording, record, target_number
 from liir_common.replay.write import write
 from liir_common.rollout.fused import FusedPlayer
 from liir_common.types import Exploration, Ticket, trajectories_equal
@@ -92,6 +92,16 @@ def test_every_loss_of_life_has_a_shot_before_it(sampled: Recording) -> None:
     assert losses > 10
     n = len(sampled.trajectory.actions[0])
     assert all((shot.attacker < n) != (shot.target < n) for shots in sampled.shots for shot in shots)
+
+
+@pytest.mark.parametrize(
+    ("team", "unit_type", "place"),
+    [("ally", "marine", 6), ("enemy", "marine", 1), ("ally", "medivac", 1), ("enemy", "medivac", 6)],
+)
+def test_targets_are_places_in_the_frame(sampled: Recording, team: str, unit_type: str, place: int) -> None:
+    unit: Any = sampled.frames[0][0] | {"team": team, "unit_type": unit_type}
+    assert target_number(unit | {"target": 1}, n_allies=5) == place
+    assert target_number(unit | {"target": None}, n_allies=5) is None
 
 
 class Scripts(HTMLParser):

@@ -52,7 +52,7 @@ class Service:
                 stderr=file,
                 stdin=subprocess.DEVNULL,
                 process_group=0,
-                preexec_fn=_die_with_parent,
+                preexec_fn=die_with_parent,
             )
 
     @property
@@ -85,7 +85,7 @@ class Service:
         return True
 
 
-def _die_with_parent() -> None:
+def die_with_parent() -> None:
     """In a child on Linux: get SIGTERM when the launcher dies, however it dies."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)

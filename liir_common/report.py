@@ -78,7 +78,7 @@ def write_results(run_dirs: Sequence[Path], output: Path) -> None:
     for run_dir in run_dirs:
         config = yaml.safe_load((run_dir / "config.yaml").read_text(encoding="utf-8"))
         run = json.loads((run_dir / "run.json").read_text())
-        label = _label(config["algorithm"])
+        label = method_label(config["algorithm"])
         groups.setdefault(label, []).append(run_dir)
         about = {"run": run_dir.name, "method": label, "map": config["env"]["map"], "seed": config["seed"]}
         runs.append({**about, "commit": run["git"], **asdict(summarise(run_dir))})
@@ -92,7 +92,8 @@ def write_results(run_dirs: Sequence[Path], output: Path) -> None:
     plot_win_rate(groups, output / "winrate.png")
 
 
-def _label(algorithm: Mapping[str, Any]) -> str:
+def method_label(algorithm: Mapping[str, Any]) -> str:
+    """Name of the method that the `algorithm` section configures, its control named with it."""
     controls = {"λ = 0": algorithm["lambda"] == 0, "η frozen": algorithm["freeze_eta"]}
     chosen = [name for name, on in controls.items() if on and algorithm["name"] == "liir"]
     return ", ".join([algorithm["name"], *chosen])

@@ -1,0 +1,176 @@
+"""Figure 3: greedy win rate against environment steps, a panel per map, and its table (section 5.2)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from liir_common.figures.statistics import Interval, Values, bootstrap, wilson
+from liir_common.files import csv_text, write_atomic
+from liir_common.results import Curve
+
+_WINDOW = 10
+"""Evaluations that a level is the mean of: one alone jumps between 0 and 1."""
+_SMOOTH = 5
+_POINTS = 200
+
+
+@dataclass(frozen=True)
+class Row:
+    """One method on one map; win rates are greedy, means over seeds."""
+
+    map: str
+    method: str
+    seeds: int
+    env_steps: int
+    """That every seed has come to"""
+    final: float
+    """Of the last ten evaluations"""
+    final_seeds: Interval | None
+    """95 % bootstrap interval over seeds; none for a single one"""
+    final_episodes: Interval
+    """95 % Wilson interval of all test episodes in `final` taken together"""
+    best: float
+    """Of each seed's best ten evaluations in a row"""
+    best_seeds: Interval | None
+
+    def cells(self) -> dict[str, Any]:
+        """The row as flat columns."""
+        return {
+            "map": self.map,
+            "method": self.method,
+            "seeds": self.seeds,
+            "env_steps": self.env_steps,
+            "final": f"{self.final:.4f}",
+            "final_seeds_low_high": _interval(self.final_seeds),
+            "final_wilson_low_high": _interval(self.final_episodes),
+            "best": f"{self.best:.4f}",
+            "best_seeds_low_high": _interval(self.best_seeds),
+        }
+
+
+def _interval(interval: Interval | None) -> str:
+    return "" if interval is None else f"{interval[0]:.4f} {interval[1]:.4f}"
+
+
+def groups(curves: Sequence[Curve]) -> dict[str, dict[str, list[Curve]]]:
+    """The curves by map and method, in their order."""
+    by_map: dict[str, dict[str, list[Curve]]] = {}
+    for curve in curves:
+        by_map.setdefault(curve.map, {}).setdefault(curve.method, []).append(curve)
+    return by_map
+
+
+def tabulate(curves: Sequence[Curve]) -> list[Row]:
+    """A row per map and method."""
+    return [
+        _row(map_name, method, runs)
+        for map_name, methods in groups(curves).items()
+        for method, runs in methods.items()
+    ]
+
+
+def _row(map_name: str, method: str, runs: Sequence[Curve]) -> Row:
+    final = [float(np.mean(run.rates[-_WINDOW:])) for run in runs]
+    best = [float(_means(run.rates, _WINDOW).max()) for run in runs]
+    wins = sum(sum(run.wins[-_WINDOW:]) for run in runs)
+    episodes = sum(sum(run.episodes[-_WINDOW:]) for run in runs)
+    return Row(
+        map_name,
+        method,
+        len(runs),
+        min(run.env_steps[-1] for run in runs),
+        float(np.mean(final)),
+        bootstrap(final),
+        wilson(wins, episodes),
+        float(np.mean(best)),
+        bootstrap(best),
+    )
+
+
+def _means(values: Sequence[float], window: int) -> Values:
+    """Means of `window` values in a row, or of all where there are fewer."""
+    width = min(window, len(values))
+    return np.convolve(values, np.full(width, 1 / width), "valid")
+
+
+def markdown(rows: Sequence[Row]) -> str:
+    """The table for people; win rates in percent, intervals of 95 %."""
+    head = (
+        "| map | method | seeds | env steps | final | over seeds | over episodes | best | over seeds |\n"
+        "|---|---|---|---|---|---|---|---|---|\n"
+    )
+    return head + "".join(
+        f"| {r.map} | {r.method} | {r.seeds} | {r.env_steps:,} | {100 * r.final:.1f} "
+        f"| {_percent(r.final_seeds)} | {_percent(r.final_episodes)} "
+        f"| {100 * r.best:.1f} | {_percent(r.best_seeds)} |\n"
+        for r in rows
+    )
+
+
+def _percent(interval: Interval | None) -> str:
+    return "–" if interval is None else f"{100 * interval[0]:.1f} to {100 * interval[1]:.1f}"
+
+
+def points(curves: Sequence[Curve]) -> Iterator[dict[str, Any]]:
+    """Every evaluation with its Wilson interval."""
+    for curve in curves:
+        for steps, wins, episodes in zip(curve.env_steps, curve.wins, curve.episodes, strict=True):
+            low, high = wilson(wins, episodes)
+            yield {
+                "map": curve.map,
+                "method": curve.method,
+                "seed": curve.seed,
+                "env_steps": steps,
+                "wins": wins,
+                "episodes": episodes,
+                "win_rate": f"{wins / episodes:.4f}",
+                "wilson_low": f"{low:.4f}",
+                "wilson_high": f"{high:.4f}",
+            }
+
+
+def mean_curve(runs: Sequence[Curve]) -> tuple[Values, Values, Values]:
+    """Environment steps, and mean and standard deviation over seeds of the win rate there, as far as every
+    seed has come; each seed's is the mean of five evaluations, interpolated."""
+    first = max(run.env_steps[0] for run in runs)
+    grid = np.linspace(first, max(first, min(run.env_steps[-1] for run in runs)), _POINTS)
+    rates = []
+    for run in runs:
+        means = _means(run.rates, _SMOOTH)
+        rates.append(np.interp(grid, run.env_steps[-len(means) :], means))
+    return grid, np.mean(rates, 0), np.std(rates, 0, ddof=1 if len(runs) > 1 else 0)
+
+
+def write_figure(curves: Sequence[Curve], output: Path) -> list[Row]:
+    """Write figure3.png, .md and .csv (the table) and figure3-points.csv (every evaluation) into `output`."""
+    output.mkdir(parents=True, exist_ok=True)
+    table = tabulate(curves)
+    write_atomic(output / "figure3.md", markdown(table).encode())
+    write_atomic(output / "figure3.csv", csv_text([row.cells() for row in table]).encode())
+    write_atomic(output / "figure3-points.csv", csv_text(list(points(curves))).encode())
+    _draw(groups(curves), output / "figure3.png")
+    return table
+
+
+def _draw(by_map: dict[str, dict[str, list[Curve]]], output: Path) -> None:
+    from matplotlib.figure import Figure
+
+    methods = list(dict.fromkeys(method for names in by_map.values() for method in names))
+    figure = Figure(figsize=(5 * len(by_map), 4), layout="constrained")
+    panels = figure.subplots(1, len(by_map), sharey=True, squeeze=False)[0]
+    for axes, (map_name, runs_of) in zip(panels, by_map.items(), strict=True):
+        for method, runs in runs_of.items():
+            steps, mean, deviation = mean_curve(runs)
+            colour = f"C{methods.index(method)}"  # the same in every panel
+            axes.plot(steps / 1e6, mean, color=colour, label=f"{method} ({len(runs)})")
+            axes.fill_between(steps / 1e6, mean - deviation, mean + deviation, color=colour, alpha=0.2, lw=0)
+        axes.set(title=map_name, xlabel="million environment steps", ylim=(-0.02, 1.02))
+        axes.grid(alpha=0.25)
+        axes.legend(loc="lower right", title="method (seeds)")
+    panels[0].set_ylabel("greedy win rate, mean ± deviation")
+    figure.savefig(output, dpi=120)

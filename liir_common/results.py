@@ -1,0 +1,129 @@
+"""Results as one tidy table: a row per tested checkpoint, whatever run it is from."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from liir_common.errors import ConfigError
+from liir_common.files import read_table
+from liir_common.report import method_label
+
+_COPIED = (
+    "policy_version",
+    "greedy_wins",
+    "greedy_episodes",
+    "greedy_win_rate",
+    "sampled_wins",
+    "sampled_episodes",
+    "sampled_win_rate",
+)
+COLUMNS = ("run", "method", "map", "seed", "commit", "config_digest", "episode", "env_steps", *_COPIED)
+"""Columns of a results file, read and written in this order."""
+
+
+def what_matters(tree: Mapping[str, Any]) -> dict[str, Any]:
+    """The part of a configuration that the numbers depend on, the seed left out.
+
+    Where a run listens, on what machines it plays and on how many actors, changes nothing.
+    """
+    evaluation = {key: value for key, value in tree["evaluation"].items() if key != "metrics_port"}
+    return {section: tree[section] for section in ("env", "algorithm", "training")} | {
+        "evaluation": evaluation
+    }
+
+
+def config_digest(tree: Mapping[str, Any]) -> str:
+    """First 12 hex digits of the SHA-256 of `what_matters`: equal for the seeds of one experiment."""
+    return hashlib.sha256(json.dumps(what_matters(tree), sort_keys=True).encode()).hexdigest()[:12]
+
+
+def rows(run_dir: Path, method: str = "") -> list[dict[str, Any]]:
+    """The rows of one run, by episode; `method` replaces the name that its configuration gives it.
+
+    Raises:
+        ConfigError: there is no run.
+    """
+    if not (run_dir / "run.json").exists():
+        raise ConfigError(f"{run_dir} holds no run")
+    tree = yaml.safe_load((run_dir / "config.yaml").read_text(encoding="utf-8"))
+    about = {
+        "run": run_dir.name,
+        "method": method or method_label(tree["algorithm"]),
+        "map": tree["env"]["map"],
+        "seed": tree["seed"],
+        "commit": json.loads((run_dir / "run.json").read_text())["git"],
+        "config_digest": config_digest(tree),
+    }
+    tests = sorted(read_table(run_dir / "evaluations.csv"), key=lambda row: int(row["episode"]))
+    copied = ("episode", "env_steps", *_COPIED)
+    return [about | {column: test[column] for column in copied} for test in tests]
+
+
+@dataclass(frozen=True)
+class Curve:
+    """The evaluations of one run, in order."""
+
+    method: str
+    map: str
+    seed: int
+    env_steps: list[int]
+    wins: list[int]
+    """Greedy wins"""
+    episodes: list[int]
+
+    @property
+    def rates(self) -> list[float]:
+        """Greedy win rates."""
+        return [wins / episodes for wins, episodes in zip(self.wins, self.episodes, strict=True)]
+
+
+def read_curves(sources: Sequence[Path]) -> list[Curve]:
+    """All runs with evaluations in `sources`: results files, or run directories.
+
+    Raises:
+        ConfigError: a source is neither, none has an evaluation, or two runs say they are the same.
+    """
+    runs: dict[tuple[str, str, int], list[Mapping[str, Any]]] = {}
+    for row in (row for source in sources for row in _read(source)):
+        runs.setdefault((row["map"], row["method"], int(row["seed"])), []).append(row)
+    if not runs:
+        raise ConfigError(f"no evaluation in {', '.join(map(str, sources))}")
+    return [_curve(*key, found) for key, found in runs.items()]
+
+
+def _read(source: Path) -> Iterable[Mapping[str, Any]]:
+    if source.is_dir():
+        return rows(source)
+    if not source.exists():
+        raise ConfigError(f"{source}: wanted a results file (CSV) or a run directory, got nothing there")
+    table = read_table(source)
+    missing = set(COLUMNS) - set(table[0] if table else COLUMNS)
+    if missing:
+        raise ConfigError(f"{source} is not a results file: it lacks {', '.join(sorted(missing))}")
+    return table
+
+
+def _curve(map_name: str, method: str, seed: int, found: list[Mapping[str, Any]]) -> Curve:
+    """One run's curve; a second run under the same name would be averaged into it unseen."""
+    names = {(row["run"], row["config_digest"]) for row in found}
+    if len(names) > 1 or len({row["episode"] for row in found}) < len(found):
+        raise ConfigError(
+            f"{method} on {map_name}, seed {seed}, is there more than once: {sorted(names)}; "
+            "leave out all but one"
+        )
+    found.sort(key=lambda row: int(row["episode"]))
+    return Curve(
+        method,
+        map_name,
+        seed,
+        [int(row["env_steps"]) for row in found],
+        [int(row["greedy_wins"]) for row in found],
+        [int(row["greedy_episodes"]) for row in found],
+    )

@@ -1,0 +1,288 @@
+"""`liir sweep`: methods × maps × seeds from one YAML file, each run a `liir train` process with a directory
+of its own.
+
+What is finished is skipped, what was interrupted goes on, so the same command again completes a sweep.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import reduce
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import yaml
+from pydantic import Field, ValidationError
+
+from liir_common import results
+from liir_common.config import Config, Section, from_tree, merge, parse_settings
+from liir_common.errors import ConfigError
+from liir_common.files import csv_text, read_table, write_atomic
+from liir_common.launch import die_with_parent
+
+_POLL_S = 0.5
+# Several runs share a machine, so every server takes a free port.
+_FREE_PORTS = {
+    "learner": {"port": 0, "metrics_port": 0},
+    "actors": {"metrics_port": 0},
+    "evaluation": {"metrics_port": 0},
+}
+_WHERE_IT_RUNS = ("actors", "learner")
+"""Sections that a run takes anew when it goes on, maybe on another machine."""
+
+
+class SweepConfig(Section):
+    """The YAML file; what comes later in this list is stronger."""
+
+    base: dict[str, Any] = Field({})
+    """Settings of every run."""
+    maps: dict[str, dict[str, Any]] = Field(min_length=1)
+    """Settings by map; the key is the map's name."""
+    methods: dict[str, dict[str, Any]] = Field(min_length=1)
+    """Settings by method; the key is the algorithm's name unless the settings say another (a control)."""
+    seeds: list[int] = Field(min_length=1)
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run of a sweep."""
+
+    map: str
+    method: str
+    seed: int
+    config: Config
+
+    @property
+    def name(self) -> str:
+        """Name of its directory."""
+        return f"{self.map}-{self.method}-seed{self.seed}"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a run of a sweep ended."""
+
+    name: str
+    status: str
+    """complete, failed, stopped, or skipped because it was complete already"""
+    exit_code: int
+    log: Path
+
+    @property
+    def failed(self) -> bool:
+        """Whether the run is not complete."""
+        return self.status in ("failed", "stopped")
+
+
+def plan(
+    path: Path,
+    methods: Sequence[str] = (),
+    maps: Sequence[str] = (),
+    seeds: Sequence[int] = (),
+    settings: Sequence[str] = (),
+) -> list[Run]:
+    """The runs of the sweep at `path`, or the part that is named; `settings` (key.sub=value) are strongest.
+
+    The environment has no say, so that a sweep is what its file and command line say.
+
+    Raises:
+        ConfigError: the file is no sweep, a name is not in it, or a run's configuration cannot be used.
+    """
+    sweep = _read(path)
+    over = parse_settings(settings)
+    return [
+        _resolve(sweep, map_name, method, seed, over)
+        for map_name in _chosen("map", maps, sweep.maps)
+        for method in _chosen("method", methods, sweep.methods)
+        for seed in seeds or sweep.seeds
+    ]
+
+
+def _read(path: Path) -> SweepConfig:
+    try:
+        return SweepConfig.model_validate(yaml.safe_load(path.read_text(encoding="utf-8")))
+    except OSError as error:
+        raise ConfigError(f"cannot read the sweep {path}: {error.strerror}") from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path} is not YAML: {error}") from None
+    except ValidationError as error:
+        raise ConfigError(f"{path} is not a sweep of base, maps, methods and seeds: {error}") from None
+
+
+def _chosen(kind: str, names: Sequence[str], known: Mapping[str, Any]) -> Sequence[str]:
+    unknown = set(names) - known.keys()
+    if unknown:
+        raise ConfigError(f"unknown {kind} {', '.join(sorted(unknown))}; this sweep has {', '.join(known)}")
+    return names or list(known)
+
+
+def _resolve(sweep: SweepConfig, map_name: str, method: str, seed: int, over: Mapping[str, Any]) -> Run:
+    named = {"seed": seed, "env": {"map": map_name}, "algorithm": {"name": method}}
+    layers = [sweep.base, named, sweep.maps[map_name], sweep.methods[method], over, _FREE_PORTS]
+    try:
+        return Run(map_name, method, seed, from_tree(reduce(merge, layers, {})))
+    except ConfigError as error:
+        raise ConfigError(f"{method} on {map_name}: {error}") from None
+
+
+class Sweep:
+    """Runs the runs, some at a time."""
+
+    def __init__(self, runs: Sequence[Run], output: Path) -> None:
+        """Keep everything under `output`.
+
+        Raises:
+            ConfigError: a run directory there belongs to another configuration.
+        """
+        self._output = output
+        self._runs = runs
+        self._stop_signal = 0
+        self._outcomes: list[Outcome] = []
+        for folder in ("configs", "logs"):
+            (output / folder).mkdir(parents=True, exist_ok=True)
+        for run in runs:
+            self._check(run)
+
+    def run(self, jobs: int = 1) -> list[Outcome]:
+        """Complete every run, `jobs` at once, in order; a failed one does not stop the others.
+
+        results.csv and runs.csv are written anew whenever one ends. A signal asks the runs to save and
+        end; what had not begun is left out of the outcomes.
+        """
+        for signum in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(signum, self._on_signal)
+        waiting, running = deque(self._runs), dict[str, tuple[Run, subprocess.Popen[bytes]]]()
+        try:
+            while running or (waiting and not self._stop_signal):
+                while waiting and len(running) < jobs and not self._stop_signal:
+                    self._begin(waiting.popleft(), running)
+                self._collect(running)
+                time.sleep(_POLL_S if running else 0)
+        finally:
+            for _, process in running.values():
+                process.terminate()
+        self._write()
+        return self._outcomes
+
+    def _on_signal(self, signum: int, frame: FrameType | None) -> None:
+        self._stop_signal = signum
+
+    def _begin(self, run: Run, running: dict[str, tuple[Run, subprocess.Popen[bytes]]]) -> None:
+        if is_complete(self._output / run.name, run.config):
+            self._end(run, "skipped", 0)
+            return
+        resumed = (self._output / run.name / "run.json").exists()
+        _say(f"{run.name} {'goes on' if resumed else 'begins'}")
+        with self._log(run).open("ab") as file:
+            process = subprocess.Popen(
+                self._command(run, resumed),
+                stdout=file,
+                stderr=file,
+                stdin=subprocess.DEVNULL,
+                # The run's configuration is complete: variables for this process are not meant for it.
+                env={name: value for name, value in os.environ.items() if not name.startswith("LIIR_")},
+                process_group=0,
+                preexec_fn=die_with_parent,
+            )
+        running[run.name] = run, process
+
+    def _command(self, run: Run, resumed: bool) -> list[str]:
+        tree, config = run.config.tree(), self._output / "configs" / f"{run.name}.yaml"
+        write_atomic(config, yaml.safe_dump(tree, sort_keys=False).encode())
+        where = [part for key in _WHERE_IT_RUNS for part in ("--set", f"{key}={json.dumps(tree[key])}")]
+        source = ["--resume", *where] if resumed else ["--config", str(config)]
+        return [
+            sys.executable,
+            "-m",
+            "liir_common.cli",
+            "train",
+            "--run-dir",
+            str(self._output / run.name),
+            *source,
+        ]
+
+    def _collect(self, running: dict[str, tuple[Run, subprocess.Popen[bytes]]]) -> None:
+        """Take in those that ended; after a signal, ask the others to."""
+        for name, (run, process) in list(running.items()):
+            code = process.poll()
+            if code is not None:
+                del running[name]
+                complete = code == 0 and is_complete(self._output / name, run.config)
+                stopped = "stopped" if self._stop_signal else "failed"
+                self._end(run, "complete" if complete else stopped, code)
+            elif self._stop_signal:
+                process.terminate()
+
+    def _end(self, run: Run, status: str, code: int) -> None:
+        outcome = Outcome(run.name, status, code, self._log(run))
+        self._outcomes.append(outcome)
+        _say(f"{run.name} {status}" + (f" with code {code}; see {outcome.log}" if status == "failed" else ""))
+        self._write()
+
+    def _write(self) -> None:
+        """Gather every run of the plan that has begun, whenever it ran."""
+        begun = [run for run in self._runs if (self._output / run.name / "run.json").exists()]
+        rows = [row for run in begun for row in results.rows(self._output / run.name, run.method)]
+        write_atomic(self._output / "results.csv", csv_text(rows, results.COLUMNS).encode())
+        runs = [self._row(run) for run in self._runs]
+        write_atomic(self._output / "runs.csv", csv_text(runs).encode())
+
+    def _row(self, run: Run) -> dict[str, Any]:
+        ended = {outcome.name: outcome.status for outcome in self._outcomes}.get(run.name)
+        run_dir = self._output / run.name
+        complete = is_complete(run_dir, run.config)
+        begun = "begun" if (run_dir / "run.json").exists() else "waiting"
+        steps = read_table(run_dir / "metrics.csv")
+        return {
+            "run": run.name,
+            "method": run.method,
+            "map": run.map,
+            "seed": run.seed,
+            "config_digest": results.config_digest(run.config.tree()),
+            "status": "complete" if complete else ended or begun,
+            "env_steps": int(steps[-1]["env_steps"]) if steps else 0,
+            "total_env_steps": run.config.training.total_env_steps,
+        }
+
+    def _log(self, run: Run) -> Path:
+        return self._output / "logs" / f"{run.name}.log"
+
+    def _check(self, run: Run) -> None:
+        kept = self._output / run.name / "config.yaml"
+        if not kept.exists():
+            return
+        tree = yaml.safe_load(kept.read_text(encoding="utf-8"))
+        there, wanted = results.what_matters(tree), results.what_matters(run.config.tree())
+        differ = [
+            f"{section}.{key}: {there[section].get(key)!r} there, {value!r} wanted"
+            for section, values in wanted.items()
+            for key, value in values.items()
+            if there[section].get(key) != value
+        ]
+        if differ:
+            raise ConfigError(
+                f"{kept.parent} was trained with other settings ({'; '.join(differ)}); name another "
+                "--output, or move it away to train anew"
+            )
+
+
+def is_complete(run_dir: Path, config: Config) -> bool:
+    """Whether the run has all its environment steps and, if it tests its checkpoints, all their tests."""
+    steps = read_table(run_dir / "metrics.csv")
+    if not steps or int(steps[-1]["env_steps"]) < config.training.total_env_steps:
+        return False
+    frozen = int(steps[-1]["episodes"]) // config.training.checkpoint_interval
+    return not config.evaluation.enabled or len(read_table(run_dir / "evaluations.csv")) == frozen
+
+
+def _say(line: str) -> None:
+    print(f"{time.strftime('%H:%M:%S')} {line}", file=sys.stderr, flush=True)

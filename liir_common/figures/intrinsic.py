@@ -68,8 +68,8 @@ def write_figure(
 def _draw(battle: Battle, r_in: FloatArray, marks: dict[int, str], title: str, output: Path) -> None:
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(max(7, 3.2 * len(marks)), 7), layout="constrained")
-    above, below = np.asarray(figure.subfigures(2, 1))
+    figure = Figure(figsize=(max(7, 4 * len(marks)), 5.5), layout="constrained")
+    above, below = np.asarray(figure.subfigures(2, 1, height_ratios=[3, 2]))
     axes = above.subplots()
     for agent, values in enumerate(r_in.T):
         axes.plot(values, marker=".", label=f"agent {agent}")
@@ -85,9 +85,9 @@ def _draw(battle: Battle, r_in: FloatArray, marks: dict[int, str], title: str, o
 
 
 def _view(battle: Battle) -> tuple[float, float, float, float]:
-    """The part of the field where units are during the battle: west, east, south, north."""
+    """West, east, south and north end of where units are during the battle, with room for text."""
     xs, ys = zip(*((u["x"], u["y"]) for units in battle.units for u in units), strict=True)
-    return min(xs) - 1, max(xs) + 1, min(ys) - 1, max(ys) + 1
+    return min(xs) - 4, max(xs) + 4, min(ys) - 1, max(ys) + 1
 
 
 def _draw_units(axes: Any, units: Sequence[UnitRecord], view: tuple[float, float, float, float]) -> None:
@@ -106,6 +106,7 @@ def _draw_units(axes: Any, units: Sequence[UnitRecord], view: tuple[float, float
         )
         shield = f"+{unit['shield']:.0f}" if unit["shield_max"] else ""
         text = f"{unit['id']}: {unit['health']:.0f}{shield}"
+        offset, side = ((-6, 0), "right") if unit["team"] == "ally" else ((6, 0), "left")
         axes.annotate(
-            text, at, xytext=(0, 7), textcoords="offset points", ha="center", fontsize=7, color=colour
+            text, at, offset, textcoords="offset points", ha=side, va="center", fontsize=7, color=colour
         )

@@ -1,0 +1,98 @@
+"""Results files and figure 3, from runs whose win rates are known."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from liir_common.errors import ConfigError
+from liir_common.figures.curves import mean_curve, points, tabulate, write_figure
+from liir_common.files import csv_text, read_table
+from liir_common.results import COLUMNS, config_digest, read_curves, rows
+from tests.trained import add_evaluations, make_run
+
+
+def runs(folder: Path) -> list[Path]:
+    """LIIR loses and then wins with seed 1, wins half with seed 2; its control never wins."""
+    return [
+        add_evaluations(make_run(folder / "a", "seed=1", episodes=()), [0] * 10 + [20] * 10),
+        add_evaluations(make_run(folder / "b", "seed=2", episodes=()), [10] * 15),
+        add_evaluations(make_run(folder / "c", "algorithm.lambda=0", episodes=()), [0] * 3),
+    ]
+
+
+def test_a_results_file_and_run_directories_say_the_same(tmp_path: Path) -> None:
+    found = runs(tmp_path)
+    table = [row for run in found for row in rows(run)]
+    assert tuple(table[0]) == COLUMNS
+    (tmp_path / "results.csv").write_text(csv_text(table, COLUMNS))
+    assert read_curves([tmp_path / "results.csv"]) == read_curves(found)
+    first = read_curves(found)[0]
+    assert (first.method, first.map, first.seed) == ("liir", "3m", 1)
+    assert first.env_steps == [1000 * i for i in range(1, 21)]
+    assert first.rates == [0.0] * 10 + [1.0] * 10
+
+
+def test_the_digest_is_of_what_the_numbers_depend_on(tmp_path: Path) -> None:
+    digests = {row["config_digest"] for run in runs(tmp_path)[:2] for row in rows(run)}
+    other = rows(runs(tmp_path / "again")[2])[0]["config_digest"]
+    assert len(digests) == 1
+    assert other not in digests
+    tree = {"env": {}, "algorithm": {}, "training": {}, "evaluation": {"metrics_port": 1, "episodes": 20}}
+    assert config_digest(tree | {"seed": 1, "learner": {"port": 2}}) == config_digest(
+        tree | {"evaluation": {"metrics_port": 3, "episodes": 20}}
+    )
+
+
+def test_levels_are_means_over_ten_evaluations_and_over_seeds(tmp_path: Path) -> None:
+    liir, control = tabulate(read_curves(runs(tmp_path)))
+    assert (liir.method, liir.seeds, liir.env_steps) == ("liir", 2, 15_000)
+    assert (liir.final, liir.best) == pytest.approx((0.75, 0.75))
+    assert liir.final_seeds == (0.5, 1.0)
+    assert liir.final_episodes[0] < 0.75 < liir.final_episodes[1]
+    assert (control.method, control.final, control.final_seeds) == ("liir, λ = 0", 0.0, None)
+    assert control.final_episodes[1] == pytest.approx(0.060, abs=1e-3)  # 0 of 60
+
+
+def test_best_is_not_final(tmp_path: Path) -> None:
+    run = add_evaluations(make_run(tmp_path / "a", episodes=()), [20] * 10 + [0] * 10)
+    (row,) = tabulate(read_curves([run]))
+    assert (row.best, row.final) == pytest.approx((1, 0))
+
+
+def test_the_mean_ends_where_the_first_seed_does(tmp_path: Path) -> None:
+    steps, mean, deviation = mean_curve(read_curves(runs(tmp_path)[:2]))
+    assert (steps[0], steps[-1]) == (1000, 15_000)
+    # Means of five evaluations: at 5000 steps all lost and half won, at 15 000 all won and half won.
+    assert mean[np.searchsorted(steps, 6000)] == pytest.approx(0.25)
+    assert mean[-1] == pytest.approx(0.75)
+    assert deviation[-1] == pytest.approx(np.std([1, 0.5], ddof=1))
+
+
+def test_every_point_has_its_interval(tmp_path: Path) -> None:
+    found = list(points(read_curves(runs(tmp_path))))
+    assert len(found) == 38
+    assert all(float(p["wilson_low"]) <= p["wins"] / p["episodes"] <= float(p["wilson_high"]) for p in found)
+
+
+def test_the_figure_is_a_picture_with_its_table(tmp_path: Path) -> None:
+    write_figure(read_curves(runs(tmp_path)), tmp_path / "out")
+    assert (tmp_path / "out" / "figure3.png").read_bytes().startswith(b"\x89PNG")
+    assert (
+        "| 3m | liir | 2 | 15,000 | 75.0 | 50.0 to 100.0 |" in (tmp_path / "out" / "figure3.md").read_text()
+    )
+    assert [row["final"] for row in read_table(tmp_path / "out" / "figure3.csv")] == ["0.7500", "0.0000"]
+
+
+def test_what_cannot_be_a_curve_is_named(tmp_path: Path) -> None:
+    first = runs(tmp_path)[0]
+    with pytest.raises(ConfigError, match="seed 1, is there more than once"):
+        read_curves([first, first])
+    with pytest.raises(ConfigError, match=r"evaluations\.csv is not a results file: it lacks commit"):
+        read_curves([first / "evaluations.csv"])
+    with pytest.raises(ConfigError, match="got nothing there"):
+        read_curves([tmp_path / "nowhere.csv"])
+    with pytest.raises(ConfigError, match="holds no run"):
+        read_curves([tmp_path])
+    with pytest.raises(ConfigError, match="no evaluation in"):
+        read_curves([make_run(tmp_path / "new", episodes=())])

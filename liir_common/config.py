@@ -190,9 +190,11 @@ class Config(BaseSettings):
         dotenv_settings: PydanticBaseSettingsSource,
         file_secret_settings: PydanticBaseSettingsSource,
     ) -> tuple[PydanticBaseSettingsSource, ...]:
-        """Order of the sources; the file comes last, through `load`."""
+        """Order of the sources; only `load` gives a file, and without one the arguments are all there is."""
         assert isinstance(init_settings, InitSettingsSource)
-        from_file = init_settings.init_kwargs.pop("_file", {})
+        from_file = init_settings.init_kwargs.pop("_file", None)
+        if from_file is None:
+            return (init_settings,)
         return init_settings, env_settings, InitSettingsSource(settings_cls, from_file)
 
     def tree(self) -> dict[str, Any]:

@@ -1,0 +1,135 @@
+"""Plans of sweeps: which runs, with which settings, and what belongs to a run that is there already."""
+
+from pathlib import Path
+from typing import get_args
+
+import pytest
+import yaml
+
+from liir_common import results
+from liir_common.config import AlgorithmConfig
+from liir_common.errors import ConfigError
+from liir_common.files import Table
+from liir_common.sweep import Sweep, is_complete, plan
+from tests.trained import add_evaluations, make_run
+
+ROOT = Path(__file__).parents[2]
+METHODS = get_args(AlgorithmConfig.model_fields["name"].annotation)
+SWEEP = {
+    "base": {"preset": "strong", "algorithm": {"entropy": 0.02, "gamma": 0.9}},
+    "maps": {"3m": {}, "8m": {"training": {"total_env_steps": 500}, "algorithm": {"gamma": 0.95}}},
+    "methods": {"liir": {}, "lambda0": {"algorithm": {"name": "liir", "lambda": 0, "gamma": 0.97}}},
+    "seeds": [1, 2],
+}
+
+
+def write(folder: Path, sweep: object) -> Path:
+    path = folder / "sweep.yaml"
+    path.write_text(yaml.safe_dump(sweep, sort_keys=False))
+    return path
+
+
+@pytest.fixture
+def sweep(tmp_path: Path) -> Path:
+    return write(tmp_path, SWEEP)
+
+
+def test_the_grid_is_complete_and_method_is_stronger_than_map_than_base(sweep: Path) -> None:
+    runs = {run.name: run.config for run in plan(sweep)}
+    assert list(runs)[:4] == ["3m-liir-seed1", "3m-liir-seed2", "3m-lambda0-seed1", "3m-lambda0-seed2"]
+    assert len(runs) == 8
+    plain, control = runs["8m-liir-seed2"], runs["8m-lambda0-seed1"]
+    assert (plain.env.map, plain.seed, plain.training.total_env_steps) == ("8m", 2, 500)
+    assert (plain.algorithm.name, plain.algorithm.gamma, plain.algorithm.entropy) == ("liir", 0.95, 0.02)
+    assert (control.algorithm.name, control.algorithm.lambda_, control.algorithm.gamma) == ("liir", 0, 0.97)
+    assert plain.learner.port == plain.learner.metrics_port == plain.actors.metrics_port == 0
+
+
+def test_a_part_is_named_on_the_command_line(sweep: Path) -> None:
+    (run,) = plan(sweep, ["lambda0"], ["8m"], [7], ["training.total_env_steps=9"])
+    assert (run.name, run.config.training.total_env_steps) == ("8m-lambda0-seed7", 9)
+
+
+def test_the_environment_has_no_say(sweep: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("LIIR_TRAINING__LAG", "1")
+    assert {run.config.training.lag for run in plan(sweep)} == {0}
+
+
+def test_what_is_not_there_is_named(sweep: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="unknown method vdn; this sweep has liir, lambda0"):
+        plan(sweep, methods=["vdn"])
+    with pytest.raises(ConfigError, match="unknown map 5m; this sweep has 3m, 8m"):
+        plan(sweep, maps=["5m"])
+    with pytest.raises(ConfigError, match="cannot read the sweep"):
+        plan(tmp_path / "nowhere.yaml")
+    with pytest.raises(ConfigError, match=r"magic on 3m: (.|\n)*'liir'(.|\n)*got 'magic'"):
+        plan(write(tmp_path, SWEEP | {"methods": {"magic": {}}}))
+    with pytest.raises(ConfigError, match="is not a sweep"):
+        plan(write(tmp_path, {"maps": {"3m": {}}}))
+
+
+def test_the_papers_comparison_has_its_budgets_and_controls() -> None:
+    path = ROOT / "configs" / "figure3.yaml"
+    tree = yaml.safe_load(path.read_text())
+    assert set(tree["methods"]) == {
+        "liir",
+        "iql",
+        "iac",
+        "central_v",
+        "coma",
+        "qmix",
+        "lambda0",
+        "frozen_eta",
+    }
+    known = [name for name in tree["methods"] if name in (*METHODS, "lambda0", "frozen_eta")]
+    runs = plan(path, methods=known)
+    assert len(runs) == len(known) * 4 * 5
+    budgets = {run.map: run.config.training.total_env_steps for run in runs}
+    assert budgets == {"3m": 3_000_000, "8m": 3_000_000, "2s3z": 10_000_000, "3s5z": 10_000_000}
+    # A comparison compares the method: between a control and LIIR one setting differs.
+    of = {run.method: run.config.algorithm.model_dump() for run in runs}
+    changed = {key for key, value in of["liir"].items() if of["lambda0"][key] != value}
+    assert changed == {"lambda_"}
+    assert {key for key, value in of["liir"].items() if of["frozen_eta"][key] != value} == {"freeze_eta"}
+
+
+def test_figure_2_trains_five_seeds_and_an_untrained_control() -> None:
+    runs = plan(ROOT / "configs" / "figure2.yaml")
+    assert {(run.method, run.seed) for run in runs} == {
+        (method, seed) for method in ("liir", "untrained") for seed in range(1, 6)
+    }
+    assert {run.config.algorithm.freeze_eta for run in runs if run.method == "untrained"} == {True}
+
+
+def test_seeds_share_a_digest_and_settings_do_not(sweep: Path) -> None:
+    digests: dict[tuple[str, str], set[str]] = {}
+    for run in plan(sweep):
+        digest = results.config_digest(run.config.tree())
+        digests.setdefault((run.map, run.method), set()).add(digest)
+    assert [len(found) for found in digests.values()] == [1] * 4
+    assert len(set.union(*digests.values())) == 4
+
+
+def test_complete_means_trained_and_tested(sweep: Path, tmp_path: Path) -> None:
+    (run,) = plan(sweep, ["liir"], ["3m"], [1], ["training.total_env_steps=1000"])
+    folder = make_run(tmp_path / "run", episodes=())
+    assert not is_complete(folder, run.config)
+    table = Table(folder / "metrics.csv")
+    table.append({"learner_step": 1, "env_steps": 999, "episodes": 250})
+    add_evaluations(folder, [1])
+    assert not is_complete(folder, run.config)
+    table.append({"learner_step": 2, "env_steps": 1001, "episodes": 290})
+    assert not is_complete(folder, run.config)  # two checkpoints, one tested
+    (folder / "evaluations.csv").unlink()
+    add_evaluations(folder, [1, 2])
+    assert is_complete(folder, run.config)
+
+
+def test_a_run_with_other_settings_is_never_mixed_in(sweep: Path, tmp_path: Path) -> None:
+    runs = plan(sweep, ["liir"], ["3m"], [1])
+    folder = tmp_path / "out" / "3m-liir-seed1"
+    make_run(folder, "algorithm.entropy=0.02", "algorithm.gamma=0.9", "learner.port=7", episodes=())
+    Sweep(runs, tmp_path / "out")  # where it listened does not matter
+    make_run(folder, "algorithm.entropy=0.5", "algorithm.gamma=0.9", episodes=())
+    with pytest.raises(ConfigError, match=r"other settings \(algorithm\.entropy: 0\.5 there, 0\.02 wanted\)"):
+        Sweep(runs, tmp_path / "out")

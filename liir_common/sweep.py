@@ -146,6 +146,7 @@ class Sweep:
         self._output = output
         self._runs = runs
         self._stop_signal = 0
+        self._running: dict[str, tuple[Run, subprocess.Popen[bytes]]] = {}
         self._outcomes: list[Outcome] = []
         for folder in ("configs", "logs"):
             (output / folder).mkdir(parents=True, exist_ok=True)
@@ -160,23 +161,27 @@ class Sweep:
         """
         for signum in (signal.SIGINT, signal.SIGTERM):
             signal.signal(signum, self._on_signal)
-        waiting, running = deque(self._runs), dict[str, tuple[Run, subprocess.Popen[bytes]]]()
+        waiting = deque(self._runs)
         try:
-            while running or (waiting and not self._stop_signal):
-                while waiting and len(running) < jobs and not self._stop_signal:
-                    self._begin(waiting.popleft(), running)
-                self._collect(running)
-                time.sleep(_POLL_S if running else 0)
+            while self._running or (waiting and not self._stop_signal):
+                while waiting and len(self._running) < jobs and not self._stop_signal:
+                    self._begin(waiting.popleft())
+                self._collect()
+                time.sleep(_POLL_S if self._running else 0)
         finally:
-            for _, process in running.values():
-                process.terminate()
+            self._ask_to_end()
         self._write()
         return self._outcomes
 
     def _on_signal(self, signum: int, frame: FrameType | None) -> None:
         self._stop_signal = signum
+        self._ask_to_end()
 
-    def _begin(self, run: Run, running: dict[str, tuple[Run, subprocess.Popen[bytes]]]) -> None:
+    def _ask_to_end(self) -> None:
+        for _, process in self._running.values():
+            process.terminate()
+
+    def _begin(self, run: Run) -> None:
         if is_complete(self._output / run.name, run.config):
             self._end(run, "skipped", 0)
             return
@@ -193,7 +198,9 @@ class Sweep:
                 process_group=0,
                 preexec_fn=die_with_parent,
             )
-        running[run.name] = run, process
+        self._running[run.name] = run, process
+        if self._stop_signal:  # which came before there was anybody to ask
+            process.terminate()
 
     def _command(self, run: Run, resumed: bool) -> list[str]:
         tree, config = run.config.tree(), self._output / "configs" / f"{run.name}.yaml"
@@ -210,23 +217,21 @@ class Sweep:
             *source,
         ]
 
-    def _collect(self, running: dict[str, tuple[Run, subprocess.Popen[bytes]]]) -> None:
-        """Take in those that ended; after a signal, ask the others to."""
-        for name, (run, process) in list(running.items()):
+    def _collect(self) -> None:
+        """Take in the runs that ended."""
+        for name, (run, process) in list(self._running.items()):
             code = process.poll()
             if code is not None:
-                del running[name]
+                del self._running[name]
                 complete = code == 0 and is_complete(self._output / name, run.config)
                 stopped = "stopped" if self._stop_signal else "failed"
                 self._end(run, "complete" if complete else stopped, code)
-            elif self._stop_signal:
-                process.terminate()
+                self._write()
 
     def _end(self, run: Run, status: str, code: int) -> None:
         outcome = Outcome(run.name, status, code, self._log(run))
         self._outcomes.append(outcome)
         _say(f"{run.name} {status}" + (f" with code {code}; see {outcome.log}" if status == "failed" else ""))
-        self._write()
 
     def _write(self) -> None:
         """Gather every run of the plan that has begun, whenever it ran."""

@@ -7,9 +7,17 @@ adds is who may do what, the reward and the end of the episode.
 import numpy as np
 
 from liir_common import rng, seeds
-from liir_common.battle.tables import FIRST_ATTACK, inlined, kernel
+from liir_common.battle.tables import FIRST_ATTACK, apart, inlined, kernel
+from liir_common.battle.terrain import GROUND, MAP_SIZE
 from liir_common.battle.units import (
+    BEAM_LENGTH,
+    BEAM_WIDTH,
+    ENERGY_MAX,
+    ENERGY_REGENERATION,
     FIRING_DELAY,
+    HEALING,
+    HEALING_COST,
+    HEALING_RESERVE,
     LOOPS_PER_SECOND,
     MINIMUM_DAMAGE,
     SHIELD_DELAY,
@@ -19,22 +27,22 @@ from liir_common.battle.units import (
 SIMULATOR_VERSION = "1"
 """Changes whenever the same seed and actions would give other bytes."""
 
-STEPS, TERMINATED, TRUNCATED, WON, DEAD_ALLIES, DEAD_ENEMIES = range(6)
+STEPS, TERMINATED, TRUNCATED, WON, DEAD_ALLIES, DEAD_ENEMIES, LOST = range(7)
 """Places in `Battle.status`."""
 
-LOOPS_PER_STEP = 8
 NO_OP, STOP, NORTH, SOUTH, EAST, WEST = range(FIRST_ATTACK)
 IDLE, MOVE, ATTACK, ATTACK_MOVE = range(4)
 """Only a unit that attack-moves picks targets of its own: all enemies do, no ally does."""
 ORDERS = ("idle", "move", "attack", "attack_move")
 
-MOVE_AMOUNT = 2.0
 CHASE_LIMIT = 21.0
 HELP_RADIUS, HELP_PERIOD = 4.0, 2.0 * LOOPS_PER_SECOND
 _SHIELD_PER_LOOP = SHIELD_REGENERATION / LOOPS_PER_SECOND
 _SHIELD_DELAY = SHIELD_DELAY * LOOPS_PER_SECOND
 _DELAY_LOW = FIRING_DELAY[0] * LOOPS_PER_SECOND
 _DELAY_SPAN = FIRING_DELAY[1] * LOOPS_PER_SECOND - _DELAY_LOW
+_HEALED_PER_LOOP = HEALING / LOOPS_PER_SECOND
+_ENERGY_PER_LOOP = ENERGY_REGENERATION / LOOPS_PER_SECOND
 _NEVER = -1e9
 _HALF = np.uint64(1 << 63)
 
@@ -50,16 +58,36 @@ def reset(tables, battle, seed):
     for i in range(len(battle.units)):
         battle.x[i], battle.y[i] = tables.specs[i].spawn_x, tables.specs[i].spawn_y
         _spawn(battle.units[i], tables.specs[i], i >= n_allies)
+    if rules.goal_span_x != 0.0 or rules.goal_span_y != 0.0:
+        share = rng.uniform(battle.stream)
+        for i in range(n_allies, len(battle.units)):
+            battle.units[i].goal_x += share * rules.goal_span_x
+            battle.units[i].goal_y += share * rules.goal_span_y
+    if rules.hunts:
+        for i in range(n_allies, len(battle.units)):
+            battle.units[i].order, battle.units[i].target = ATTACK, _prey(rules, battle, i)
     for _ in range(rules.head_start):
         _play_loop(tables, battle, True)
 
 
 @inlined
+def _prey(rules, battle, i):
+    """The agent that enemy i is sent to attack."""
+    if not rules.hunt_nearest:
+        return np.int64(rng.uniform(battle.stream) * rules.n_allies)
+    prey = 0
+    for j in range(rules.n_allies):
+        if _distance2(battle, i, j) < _distance2(battle, i, prey):
+            prey = j
+    return prey
+
+
+@inlined
 def _spawn(unit, spec, is_enemy):
-    unit.health, unit.shield, unit.energy = spec.health, spec.shield, 0.0
+    unit.health, unit.shield, unit.energy = spec.health, spec.shield, spec.energy
     unit.ready_at = unit.hit_at = unit.free_at = 0.0
     unit.hurt_at = unit.help_at = unit.walked_at = _NEVER
-    unit.heading_x = unit.heading_y = 0.0
+    unit.pace = unit.heading_x = unit.heading_y = 0.0
     unit.goal_x, unit.goal_y = spec.goal_x, spec.goal_y
     unit.missile_x = unit.missile_y = 0.0
     unit.order = ATTACK_MOVE if is_enemy else IDLE
@@ -79,14 +107,14 @@ def step(tables, battle, actions):
     allies = _vitality(battle.units, 0, rules.n_allies)
     enemies = _vitality(battle.units, rules.n_allies, len(battle.units))
     upwards = rng.next_u64(battle.stream) < _HALF
-    for loop in range(LOOPS_PER_STEP):
+    for loop in range(rules.step_mul):
         if loop == rules.order_latency:
             _give_orders(tables, battle, actions)
         _play_loop(tables, battle, upwards)
     for i in range(rules.n_allies):
         battle.last_actions[i] = actions[i]
     status[STEPS] += 1
-    _judge(rules, status)
+    _judge(tables, battle)
     return _reward(
         rules,
         status,
@@ -106,20 +134,35 @@ def _vitality(units, first, last):
 
 
 @inlined
-def _judge(rules, status):
+def _judge(tables, battle):
     """SMAC v1: a win needs a living ally, and only a game that has not ended can reach the limit."""
+    rules, status = tables.rules[0], battle.status
     allies_gone = status[DEAD_ALLIES] == rules.n_allies
     enemies_gone = status[DEAD_ENEMIES] == rules.n_enemies
-    status[TERMINATED] = allies_gone or enemies_gone
-    status[WON] = enemies_gone and not allies_gone
+    lost, won = allies_gone and not enemies_gone, enemies_gone and not allies_gone
+    if rules.has_healers:
+        # Nobody but healers is a defeat, asked first; a single healer left of the enemies is a victory.
+        lost |= _count_fighters(tables, battle, 0, rules.n_allies) == 0
+        healer_left = _count_fighters(tables, battle, rules.n_allies, len(battle.units)) == 0
+        won |= healer_left and status[DEAD_ENEMIES] == rules.n_enemies - 1
+        won = won and not lost
+    status[LOST], status[WON] = lost, won
+    status[TERMINATED] = lost or won or (allies_gone and enemies_gone)
     status[TRUNCATED] = not status[TERMINATED] and status[STEPS] >= rules.limit
+
+
+@inlined
+def _count_fighters(tables, battle, first, last):
+    count = 0
+    for i in range(first, last):
+        count += battle.units[i].alive and not tables.specs[i].heals
+    return count
 
 
 @inlined
 def _reward(rules, status, lost_by_allies, lost_by_enemies, dead_allies, dead_enemies):
     """SMAC v1's reward of one step; shields that come back count against damage."""
-    won = status[WON] == 1
-    lost = status[DEAD_ENEMIES] < rules.n_enemies and status[DEAD_ALLIES] == rules.n_allies
+    won, lost = status[WON], status[LOST]
     if rules.reward_sparse:
         return (won - lost) / rules.reward_divisor
     reward = lost_by_enemies + rules.reward_death_value * dead_enemies
@@ -133,23 +176,27 @@ def _reward(rules, status, lost_by_allies, lost_by_enemies, dead_allies, dead_en
 
 @inlined
 def _give_orders(tables, battle, actions):
-    rules = tables.rules[0]
-    for i in range(rules.n_allies):
-        unit = battle.units[i]
-        if unit.alive:
+    for i in range(tables.rules[0].n_allies):
+        if battle.units[i].alive:
             if actions[i] >= FIRST_ATTACK:
-                _order_attack(
-                    rules, battle.clock[0], unit, tables.specs[i], rules.n_allies + actions[i] - FIRST_ATTACK
-                )
+                _order_attack(tables, battle, i, actions[i] - FIRST_ATTACK)
             else:
                 _order_move(tables, battle, i, actions[i])
 
 
 @inlined
-def _order_attack(rules, now, unit, spec, target):
+def _order_attack(tables, battle, i, number):
+    """Attack that enemy; for a healer, treat that ally. What a weapon cannot hit, the game orders in vain."""
+    rules, unit, spec = tables.rules[0], battle.units[i], tables.specs[i]
+    target = rules.n_allies + number
+    if rules.has_healers:
+        if spec.heals:
+            target = number
+        elif tables.pairs[spec.kind, tables.specs[target].kind].damage == 0.0:
+            return
     if unit.order == ATTACK and unit.target == target and not rules.repeated_order_restarts:
         return
-    _interrupt(rules, now, unit, spec)
+    _interrupt(rules, battle.clock[0], unit, spec)
     unit.order, unit.target = ATTACK, target
 
 
@@ -161,8 +208,9 @@ def _order_move(tables, battle, i, action):
     unit.order = IDLE if action == STOP else MOVE
     if unit.order == MOVE:
         unit.free_at = now
-        unit.goal_x = battle.x[i] + MOVE_AMOUNT * ((action == EAST) - (action == WEST))
-        unit.goal_y = battle.y[i] + MOVE_AMOUNT * ((action == NORTH) - (action == SOUTH))
+        length = tables.rules[0].move_amount
+        unit.goal_x = battle.x[i] + length * ((action == EAST) - (action == WEST))
+        unit.goal_y = battle.y[i] + length * ((action == NORTH) - (action == SOUTH))
 
 
 @inlined
@@ -190,6 +238,8 @@ def _play_loop(tables, battle, upwards):
             walkers += _act(tables, battle, i, now, upwards)
     if tables.rules[0].has_missiles:
         _fly_missiles(tables, battle, now)
+    if tables.rules[0].has_areas:
+        _blast_all(tables, battle, now)
     if walkers:
         _separate(tables, battle, now)
     battle.clock[0] = now + 1.0
@@ -203,6 +253,8 @@ def _act(tables, battle, i, now, upwards):
         unit.shield = min(spec.shield, unit.shield + _SHIELD_PER_LOOP)
     if spec.regeneration > 0.0:
         unit.health = min(spec.health, unit.health + spec.regeneration)
+    if tables.rules[0].has_healers and spec.heals:
+        return _treat(tables, battle, i, now)
     if unit.hits > 0:
         if now >= unit.hit_at:
             _release(tables, battle, i, now)
@@ -273,12 +325,17 @@ def _attack(tables, battle, i, now):
     """
     unit, spec = battle.units[i], tables.specs[i]
     if not battle.units[unit.target].alive:
-        unit.order, unit.target = IDLE, -1
+        _rest(tables.rules[0], battle, i)
         return False
     x, y = battle.x[unit.target] - battle.x[i], battle.y[unit.target] - battle.y[i]
     if x * x + y * y > tables.pairs[spec.kind, tables.specs[unit.target].kind].reach2:
         return _walk(tables, battle, i, x, y, now)
     if now >= unit.ready_at:
+        if tables.rules[0].has_areas:
+            if spec.blast > 0.0:
+                _die(tables, battle, i)
+                return False
+            unit.missile_x, unit.missile_y = battle.x[unit.target], battle.y[unit.target]
         delay = rng.uniform(battle.stream)
         if tables.rules[0].integer_delay:
             delay = np.floor(delay * (_DELAY_SPAN + 1.0)) / _DELAY_SPAN
@@ -292,10 +349,19 @@ def _attack(tables, battle, i, now):
 
 
 @inlined
+def _rest(rules, battle, i):
+    """The target is gone: an agent's unit does nothing more, an enemy stays and looks for others."""
+    unit = battle.units[i]
+    unit.order, unit.target = IDLE, -1
+    if i >= rules.n_allies:
+        unit.order, unit.goal_x, unit.goal_y = ATTACK_MOVE, battle.x[i], battle.y[i]
+
+
+@inlined
 def _release(tables, battle, i, now):
     """The next hit of the attack under way; a dead target ends the attack."""
     unit, spec = battle.units[i], tables.specs[i]
-    if not battle.units[unit.aim].alive:
+    if not battle.units[unit.aim].alive and not (spec.beams and unit.hits == spec.hits):
         if unit.hits == spec.hits and tables.rules[0].cooldown_from_release:
             unit.ready_at = now
         unit.hits = 0
@@ -304,7 +370,9 @@ def _release(tables, battle, i, now):
     unit.hit_at += spec.hit_interval
     if tables.rules[0].stand_after_hit:
         unit.free_at = now + spec.backswing
-    if spec.missile_speed > 0.0:
+    if spec.beams:
+        _beam(tables, battle, i, now)
+    elif spec.missile_speed > 0.0:
         unit.missile_x, unit.missile_y, unit.missile_target = battle.x[i], battle.y[i], unit.aim
     else:
         _hit(tables, battle, i, unit.aim, now)
@@ -313,7 +381,7 @@ def _release(tables, battle, i, now):
 @inlined
 def _hit(tables, battle, attacker, victim, now):
     """Damage goes to the shield first; what is left of it loses the armor and goes to life."""
-    target, spec, rules = battle.units[victim], tables.specs[victim], tables.rules[0]
+    target, spec = battle.units[victim], tables.specs[victim]
     damage = tables.pairs[tables.specs[attacker].kind, spec.kind].damage
     absorbed = min(damage, target.shield)
     target.shield -= absorbed
@@ -322,28 +390,151 @@ def _hit(tables, battle, attacker, victim, now):
     target.hurt_at = now
     target.attacker = attacker
     if target.health <= 0.0:
-        target.health = target.shield = 0.0
-        target.alive = False
-        battle.status[DEAD_ALLIES if victim < rules.n_allies else DEAD_ENEMIES] += 1
+        _die(tables, battle, victim)
     elif target.order == ATTACK_MOVE and target.target < 0:
-        _respond(rules, battle, victim, now)
+        _respond(tables, battle, victim, now)
+
+
+_strike = apart(_hit.py_func)
 
 
 @inlined
-def _respond(rules, battle, victim, now):
+def _die(tables, battle, i):
+    unit, rules = battle.units[i], tables.rules[0]
+    unit.health = unit.shield = 0.0
+    unit.alive = False
+    unit.hits = tables.specs[i].blast > 0.0
+    battle.status[DEAD_ALLIES if i < rules.n_allies else DEAD_ENEMIES] += 1
+
+
+@apart
+def _respond(tables, battle, victim, now):
     """An enemy without a target takes the one that hit it, and calls others that have none."""
-    caller = battle.units[victim]
+    caller, rules = battle.units[victim], tables.rules[0]
+    attacker = caller.attacker
     if not rules.chase_attacker:
         return
-    caller.target = caller.attacker
+    if _can_hit(tables, victim, attacker):
+        caller.target = attacker
     if not rules.call_for_help or now < caller.help_at + HELP_PERIOD:
         return
     caller.help_at = now
     for i in range(rules.n_allies, len(battle.units)):
         friend = battle.units[i]
         waits = friend.alive and friend.order == ATTACK_MOVE and friend.target < 0
-        if waits and _distance2(battle, victim, i) <= HELP_RADIUS**2:
-            friend.target = friend.attacker = caller.attacker
+        if waits and _distance2(battle, victim, i) <= HELP_RADIUS**2 and _can_hit(tables, i, attacker):
+            friend.target = friend.attacker = attacker
+
+
+@inlined
+def _can_hit(tables, attacker, target):
+    return tables.pairs[tables.specs[attacker].kind, tables.specs[target].kind].damage > 0.0
+
+
+@inlined
+def _first_enemy(rules, i):
+    """Where the team begins that i fights; the other ends there or is the last."""
+    return rules.n_allies if i < rules.n_allies else 0
+
+
+@inlined
+def _last_enemy(rules, i):
+    return rules.n_allies + rules.n_enemies if i < rules.n_allies else rules.n_allies
+
+
+@apart
+def _beam(tables, battle, i, now):
+    """At the first hit the beams have swept what stands beside the target, at the second they end on it."""
+    unit, spec, rules = battle.units[i], tables.specs[i], tables.rules[0]
+    if unit.hits == 0:
+        for _ in range(spec.beams):
+            if battle.units[unit.aim].alive:
+                _strike(tables, battle, i, unit.aim, now)
+        return
+    x, y = unit.missile_x - battle.x[i], unit.missile_y - battle.y[i]
+    distance = np.sqrt(x * x + y * y)
+    if distance > 0.0:
+        x, y = x / distance, y / distance
+    for j in range(_first_enemy(rules, i), _last_enemy(rules, i)):
+        dx, dy = battle.x[j] - unit.missile_x, battle.y[j] - unit.missile_y
+        # Along the sweep, beyond its ends, and away from it.
+        beyond = max(0.0, abs(dy * x - dx * y) - 0.5 * BEAM_LENGTH)
+        away = dx * x + dy * y
+        within = 0.5 * BEAM_WIDTH + tables.specs[j].radius
+        if j != unit.aim and beyond * beyond + away * away <= within * within and _can_hit(tables, i, j):
+            for _ in range(spec.beams):
+                if battle.units[j].alive:
+                    _strike(tables, battle, i, j, now)
+
+
+@apart
+def _blast_all(tables, battle, now):
+    """Blasts of the units that died in this loop, and of those that the blasts kill."""
+    rules, more = tables.rules[0], True
+    while more:
+        more = False
+        for i in range(len(battle.units)):
+            unit, spec = battle.units[i], tables.specs[i]
+            if unit.alive or unit.hits == 0 or spec.blast == 0.0:
+                continue
+            unit.hits = 0
+            for j in range(_first_enemy(rules, i), _last_enemy(rules, i)):
+                within = spec.blast + tables.specs[j].radius
+                if battle.units[j].alive and _distance2(battle, i, j) <= within * within:
+                    _strike(tables, battle, i, j, now)
+                    more |= not battle.units[j].alive
+
+
+@apart
+def _treat(tables, battle, i, now):
+    """What a healer does in one loop; whether it moves."""
+    unit = battle.units[i]
+    unit.energy = min(ENERGY_MAX, unit.energy + _ENERGY_PER_LOOP)
+    if unit.order == ATTACK_MOVE or (unit.order == IDLE and tables.rules[0].medivac_autocast):
+        unit.target = _patient(tables, battle, i)
+    x, y = unit.goal_x - battle.x[i], unit.goal_y - battle.y[i]
+    if unit.target >= 0:
+        patient, spec = battle.units[unit.target], tables.specs[unit.target]
+        x, y = battle.x[unit.target] - battle.x[i], battle.y[unit.target] - battle.y[i]
+        if not patient.alive:
+            unit.order, unit.target = IDLE, -1
+            return False
+        if x * x + y * y <= tables.pairs[tables.specs[i].kind, spec.kind].reach2:
+            healed = min(_HEALED_PER_LOOP, spec.health - patient.health, unit.energy / HEALING_COST)
+            patient.health += healed
+            unit.energy -= healed * HEALING_COST
+            return False
+    elif unit.order == IDLE:
+        return False
+    return _walk(tables, battle, i, x, y, now)
+
+
+@inlined
+def _patient(tables, battle, i):
+    """Whom a healer treats of its own accord: of the hurt nearby the one with the least share of life, and of
+    equals the nearest; a treatment under way goes on while there is energy. -1 for nobody."""
+    unit, rules = battle.units[i], tables.rules[0]
+    if unit.target >= 0 and unit.energy > 0.0 and _may_treat(tables, battle, i, unit.target):
+        return unit.target
+    if unit.energy < HEALING_RESERVE:
+        return -1
+    first = 0 if i < rules.n_allies else rules.n_allies
+    last = rules.n_allies if i < rules.n_allies else len(battle.units)
+    patient, least, nearest2 = -1, 1.0, np.inf
+    for j in range(first, last):
+        if _may_treat(tables, battle, i, j):
+            share, distance2 = battle.units[j].health / tables.specs[j].health, _distance2(battle, i, j)
+            if share < least or (share == least and distance2 < nearest2):
+                patient, least, nearest2 = j, share, distance2
+    return patient
+
+
+@inlined
+def _may_treat(tables, battle, i, j):
+    """Whether j is alive, biological, hurt and within the search range of healer i."""
+    spec = tables.specs[j]
+    near = _distance2(battle, i, j) <= tables.pairs[tables.specs[i].kind, spec.kind].scan2
+    return near and battle.units[j].alive and spec.biological and battle.units[j].health < spec.health
 
 
 @inlined
@@ -389,22 +580,44 @@ def _walk(tables, battle, i, x, y, now):
 
     Whether it walks.
     """
-    unit, distance2 = battle.units[i], x * x + y * y
+    unit, spec, distance2 = battle.units[i], tables.specs[i], x * x + y * y
     if now < unit.free_at or distance2 == 0.0:
         return False
-    share = min(1.0, tables.specs[i].speed / np.sqrt(distance2))
+    if tables.rules[0].has_obstacles and spec.layer == GROUND:
+        x, y = _around(tables, battle, i, x, y)
+        distance2 = x * x + y * y
+    speed = spec.speed
+    if tables.rules[0].has_healers:
+        # Only aircraft take more than a loop to get going.
+        unit.pace = speed = min(
+            speed, (unit.pace if unit.walked_at == now - 1.0 else 0.0) + spec.acceleration
+        )
+    share = min(1.0, speed / np.sqrt(distance2))
     unit.heading_x, unit.heading_y = x * share, y * share
     unit.walked_at = now
-    _displace(tables.pathing, battle, i, unit.heading_x, unit.heading_y)
+    _displace(tables, battle, i, unit.heading_x, unit.heading_y)
     return True
 
 
+@apart
+def _around(tables, battle, i, x, y):
+    """The way to the next bend, or (x, y) where nothing stands in that way."""
+    to_x = min(max(int(battle.x[i] + x), 0), MAP_SIZE - 1)
+    to_y = min(max(int(battle.y[i] + y), 0), MAP_SIZE - 1)
+    start = int(battle.x[i]) * MAP_SIZE + int(battle.y[i])
+    bend = tables.routes[start, to_x * MAP_SIZE + to_y]
+    if bend < 0:
+        return x, y
+    return bend // MAP_SIZE + 0.5 - battle.x[i], bend % MAP_SIZE + 0.5 - battle.y[i]
+
+
 @inlined
-def _displace(pathing, battle, i, x, y):
+def _displace(tables, battle, i, x, y):
     """Move a unit, axis by axis, as far as the ground allows; so units slide along walls."""
-    if pathing[int(battle.x[i] + x), int(battle.y[i])]:
+    layer = tables.specs[i].layer
+    if tables.layers[layer, int(battle.x[i] + x), int(battle.y[i])]:
         battle.x[i] += x
-    if pathing[int(battle.x[i]), int(battle.y[i] + y)]:
+    if tables.layers[layer, int(battle.x[i]), int(battle.y[i] + y)]:
         battle.y[i] += y
 
 
@@ -441,7 +654,7 @@ def _part(tables, battle, i, j, distance, contact, both_walked):
         _give_way(tables, battle, j, -x, -y, 0.5 * overlap)
     elif rules.push_idle and is_friend and battle.units[j].order == IDLE:
         _give_way(tables, battle, i, x, y, 0.5 * overlap)
-        _displace(tables.pathing, battle, j, -0.5 * overlap * x, -0.5 * overlap * y)
+        _displace(tables, battle, j, -0.5 * overlap * x, -0.5 * overlap * y)
     else:
         _give_way(tables, battle, i, x, y, overlap)
 
@@ -453,4 +666,4 @@ def _give_way(tables, battle, i, x, y, overlap):
     if unit.heading_x * x + unit.heading_y * y < 0.0:
         leftward = unit.heading_y * x - unit.heading_x * y >= 0.0
         slide = tables.rules[0].slide if leftward else -tables.rules[0].slide
-    _displace(tables.pathing, battle, i, overlap * (x - slide * y), overlap * (y + slide * x))
+    _displace(tables, battle, i, overlap * (x - slide * y), overlap * (y + slide * x))

@@ -16,8 +16,9 @@ from liir_common.battle.observation import observe
 from liir_common.battle.parameters import resolve
 from liir_common.battle.policies import make_buffers
 from liir_common.battle.render import draw_ansi, draw_rgb
-from liir_common.battle.scenarios import TERRAINS, find_scenario
+from liir_common.battle.scenarios import find_scenario
 from liir_common.battle.tables import build_battle, build_tables, roster
+from liir_common.battle.units import ENERGY_MAX
 from liir_common.types import EnvSpec
 
 INFO_KEYS = ("won", "dead_allies", "dead_enemies")
@@ -52,7 +53,7 @@ class UnitRecord(TypedDict):
     order: str
     """One of `engine.ORDERS`"""
     target: int | None
-    """Number of the unit attacked, within the other team"""
+    """Number of the unit attacked, within the other team; of the unit healed, within its own"""
 
 
 class AvailableActions(Discrete):
@@ -92,7 +93,7 @@ class BattleEnv(ParallelEnv[str, Observation, np.int64]):
         scenario, settings = find_scenario(map_name), resolve(options)
         self.render_mode = render_mode
         self._unit_types = [unit.name for unit in roster(scenario, settings)[0]]
-        self._tables = build_tables(scenario, settings, TERRAINS[scenario.terrain])
+        self._tables = build_tables(scenario, settings)
         self._battle = build_battle(self._tables)
         self._buffers = make_buffers(self._tables)
         n, n_actions = self._buffers.mask.shape
@@ -116,7 +117,10 @@ class BattleEnv(ParallelEnv[str, Observation, np.int64]):
         return self._observation_spaces[agent]
 
     def action_space(self, agent: str) -> AvailableActions:
-        """SMAC v1's actions: no-op, stop, north, south, east, west, attack enemy 0, 1, ..."""
+        """SMAC v1's actions: no-op, stop, north, south, east, west, then one per enemy: attack it.
+
+        For a medivac they mean allies: heal it.
+        """
         return self._action_spaces[agent]
 
     def reset(
@@ -227,14 +231,15 @@ class BattleEnv(ParallelEnv[str, Observation, np.int64]):
             radius=float(spec["radius"]),
             alive=bool(unit["alive"]),
             order=engine.ORDERS[unit["order"]],
-            target=None if target < 0 else target - n if is_ally else target,
+            target=None if target < 0 else target - n if target >= n else target,
         )
 
     def _put(self, i: int, record: UnitRecord) -> None:
         unit, spec, n = self._battle.units[i], self._tables.specs[i], len(self.possible_agents)
         x, y, now = record["x"], record["y"], self._battle.clock[0]
-        inside = 0 <= x < self._tables.pathing.shape[0] and 0 <= y < self._tables.pathing.shape[1]
-        if not (inside and self._tables.pathing[int(x), int(y)]):
+        cells = self._tables.layers[spec["layer"]]
+        inside = 0 <= x < cells.shape[0] and 0 <= y < cells.shape[1]
+        if not (inside and cells[int(x), int(y)]):
             raise ValueError(
                 f"{record['team']} {record['id']} wants a place that units can reach, got {x, y}"
             )
@@ -242,6 +247,10 @@ class BattleEnv(ParallelEnv[str, Observation, np.int64]):
             raise ValueError(
                 f"{record['team']} {record['id']} wants health in [0, {spec['health']}] and shield in "
                 f"[0, {spec['shield']}], got {record['health']} and {record['shield']}"
+            )
+        if not 0 <= record["energy"] <= ENERGY_MAX:
+            raise ValueError(
+                f"{record['team']} {record['id']} wants energy in [0, {ENERGY_MAX}], got {record['energy']}"
             )
         if record["alive"] != (record["health"] > 0):
             raise ValueError(f"{record['team']} {record['id']}: alive wants to mean health above 0")
@@ -255,7 +264,8 @@ class BattleEnv(ParallelEnv[str, Observation, np.int64]):
         if i < n:
             unit["goal_x"], unit["goal_y"] = x, y
         target = record["target"]
-        unit["target"] = -1 if target is None else target + n if i < n else target
+        aims_at_allies = (i < n) == bool(spec["heals"])
+        unit["target"] = -1 if target is None else target if aims_at_allies else target + n
         unit["attacker"] = unit["missile_target"] = -1
 
     def render(self) -> str | NDArray[np.uint8] | None:
@@ -309,7 +319,7 @@ def battle_spec(map_name: str, **options: Any) -> EnvSpec:
         ValueError: an unknown map or option, or an illegal value.
     """
     scenario, settings = find_scenario(map_name), resolve(options)
-    rules = build_tables(scenario, settings, TERRAINS[scenario.terrain]).rules[0]
+    rules = build_tables(scenario, settings).rules[0]
     return EnvSpec(
         name=f"battle/{map_name}",
         version=engine.SIMULATOR_VERSION,

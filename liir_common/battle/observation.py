@@ -40,20 +40,30 @@ def observe(tables, battle, obs, state, mask, alive):
 
 @inlined
 def _write_moves(tables, battle, i, obs, mask):
-    """A unit may move where the ground is open one cell ahead; the observation starts with that.
+    """A unit may move where the ground is open half a move ahead; the observation starts with that.
 
     Returns where the next features go.
     """
+    rules, probe = tables.rules[0], 0.5 * tables.rules[0].move_amount
     mask[STOP] = True
     for k in range(_MOVES):
-        x, y = battle.x[i] + (k == 2) - (k == 3), battle.y[i] + (k == 0) - (k == 1)
+        x = battle.x[i] + probe * ((k == 2) - (k == 3))
+        y = battle.y[i] + probe * ((k == 0) - (k == 1))
         mask[NORTH + k] = obs[k] = _is_open(tables.pathing, int(x), int(y), False)
-    if not tables.rules[0].obs_pathing_grid:
-        return _MOVES
-    for k in range(len(_SURROUNDINGS)):
-        x, y = int(battle.x[i]) + _SURROUNDINGS[k, 0], int(battle.y[i]) + _SURROUNDINGS[k, 1]
-        obs[_MOVES + k] = _is_open(tables.pathing, x, y, True)
-    return _MOVES + len(_SURROUNDINGS)
+    at = _MOVES
+    if rules.obs_pathing_grid:
+        for k in range(len(_SURROUNDINGS)):
+            x, y = int(battle.x[i]) + _SURROUNDINGS[k, 0], int(battle.y[i]) + _SURROUNDINGS[k, 1]
+            obs[at + k] = _is_open(tables.pathing, x, y, True)
+        at += len(_SURROUNDINGS)
+    if rules.obs_terrain_height:
+        for k in range(len(_SURROUNDINGS)):
+            x, y = int(battle.x[i]) + _SURROUNDINGS[k, 0], int(battle.y[i]) + _SURROUNDINGS[k, 1]
+            inside = 0 <= x < tables.height.shape[0] and 0 <= y < tables.height.shape[1]
+            obs[at + k] = tables.height[x, y] if inside else 1.0
+        at += len(_SURROUNDINGS) + 1
+        obs[at - 1] = tables.height[int(battle.x[i]), int(battle.y[i])]
+    return at
 
 
 @inlined
@@ -68,17 +78,31 @@ def _write_enemies(tables, battle, i, obs, mask, at):
     """Features and attack availability of all enemies; returns where the next features go."""
     rules = tables.rules[0]
     width = 4 + rules.obs_all_health * (1 + rules.enemy_shields) + rules.enemy_bits
+    heals = rules.has_healers and tables.specs[i].heals
+    if heals:
+        _mask_heals(tables, battle, i, mask)
     for j in range(rules.n_enemies):
         other, spec = battle.units[rules.n_allies + j], tables.specs[rules.n_allies + j]
         distance2 = _write_place(battle, i, rules.n_allies + j, obs, at)
         if distance2 < SIGHT2:
-            mask[FIRST_ATTACK + j] = obs[at] = distance2 <= SHOOT_RANGE2
+            # SMAC v1 looks a healer's slots up as if they were attacks.
+            obs[at] = mask[FIRST_ATTACK + j] if heals else distance2 <= SHOOT_RANGE2
+            mask[FIRST_ATTACK + j] = obs[at] > 0.0
             if rules.obs_all_health:
                 _write_health(other, spec, rules.enemy_shields, obs, at + 4)
             if rules.enemy_bits:
                 obs[at + width - rules.enemy_bits + spec.type_bit] = 1.0
         at += width
     return at
+
+
+@inlined
+def _mask_heals(tables, battle, i, mask):
+    """A healer's attack actions are for allies: all that are near and no healers, even in full health."""
+    for j in range(min(tables.rules[0].n_allies, tables.rules[0].n_enemies)):
+        x, y = battle.x[j] - battle.x[i], battle.y[j] - battle.y[i]
+        near = x * x + y * y <= SHOOT_RANGE2
+        mask[FIRST_ATTACK + j] = near and battle.units[j].alive and not tables.specs[j].heals
 
 
 @inlined
@@ -147,7 +171,8 @@ def _write_state(tables, battle, state):
         if units[i].alive:
             state[at] = units[i].health * specs[i].per_health
             if is_ally:
-                state[at + 1] = max(0.0, units[i].ready_at - battle.clock[0]) / specs[i].cooldown_norm
+                waits = max(0.0, units[i].ready_at - battle.clock[0])
+                state[at + 1] = (units[i].energy if specs[i].heals else waits) / specs[i].cooldown_norm
             state[at + 1 + is_ally] = (battle.x[i] - _CENTRE) / MAP_SIZE
             state[at + 2 + is_ally] = (battle.y[i] - _CENTRE) / MAP_SIZE
             if shields:

@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from dataclasses import Field, asdict, dataclass, field, fields
 from typing import Any
 
+from liir_common.battle.units import BASE_LIBERTY, MULTIPLAYER
+
 _LARGEST = 1e9
 """No option means anything beyond it, and infinity and NaN are not within."""
 
@@ -17,7 +19,17 @@ def _at_least(default: Any, minimum: float) -> Any:
 
 @dataclass(frozen=True)
 class Options:
-    """SMAC v1's options, under its names and with its defaults."""
+    """SMAC v1's options, under its names and with its defaults.
+
+    Those that concern the game's window, version, difficulty and replays have nothing to act on here;
+    `heuristic_ai` is a policy (`policies.CLOSEST_ENEMY`), and `continuing_episode` needs no switch because
+    termination and truncation are told apart.
+    """
+
+    step_mul: int = field(default=8, metadata={"minimum": 1, "maximum": 1000})
+    """Game loops per step."""
+    move_amount: float = field(default=2.0, metadata={"minimum": 0.01, "maximum": 32})
+    """Length of a move order in cells; half of it ahead the ground must be open."""
 
     obs_all_health: bool = True
     """Observations have the life and shield of visible units; implies `obs_own_health`."""
@@ -25,6 +37,8 @@ class Options:
     obs_last_action: bool = False
     obs_pathing_grid: bool = False
     """Observations say whether the ground is open at eight points around the unit."""
+    obs_terrain_height: bool = False
+    """Observations have the height of the ground at these points and under the unit."""
     obs_timestep_number: bool = False
     obs_instead_of_state: bool = False
     """The state is all observations in a row."""
@@ -51,7 +65,7 @@ class Parameters:
 
     head_start: int = _at_least(2, 0)
     """Loops that the enemies walk before the first observation."""
-    order_latency: int = field(default=1, metadata={"minimum": 0, "maximum": 7})
+    order_latency: int = _at_least(1, 0)
     """Loops from a decision to its first effect."""
     grid_spawn: bool = False
     """Units stand on a square grid around their point instead of in hexagonal rings."""
@@ -85,8 +99,14 @@ class Parameters:
     """Enemies keep their places in the group while they walk to their goal."""
     redirect_missiles: bool = False
     """A missile whose target died flies on to the nearest unit of that team instead of being lost."""
-    liberty_balance: bool = False
-    """Weapons of the base game instead of the multiplayer layer."""
+    balance: str = field(default=MULTIPLAYER, metadata={"choices": (MULTIPLAYER, BASE_LIBERTY)})
+    """Data layer of the weapons: what measurements show, or what the map archives name."""
+    medivac_follows: bool = True
+    """Enemy medivacs take their group's attack-move as a move; else they stay. They heal in both cases."""
+    medivac_autocast: bool = False
+    """Agents' medivacs without an order heal of their own accord, as the ability does for other players."""
+    hunt_nearest: bool = True
+    """Enemies ordered to attack a group take its member nearest to them; else each a random one."""
     double_max_reward: bool = False
     """Count the enemies twice in the divisor of the reward, as SMAC v1 does after a second launch."""
 
@@ -110,7 +130,13 @@ def resolve(options: Mapping[str, Any]) -> Settings:
     unknown = sorted(set(options) - set(known))
     if unknown:
         raise ValueError(f"unknown battle options {unknown}; known: {', '.join(sorted(known))}")
-    return Settings(**{name: _checked(known[name], value) for name, value in options.items()})
+    settings = Settings(**{name: _checked(known[name], value) for name, value in options.items()})
+    if settings.order_latency >= settings.step_mul:
+        raise ValueError(
+            f"battle option order_latency wants to be less than step_mul, "
+            f"got {settings.order_latency} and {settings.step_mul}"
+        )
+    return settings
 
 
 def _checked(option: Field[Any], value: Any) -> Any:
@@ -119,6 +145,12 @@ def _checked(option: Field[Any], value: Any) -> Any:
         value = float(value)
     if type(value) is not kind:
         raise ValueError(f"battle option {option.name} wants {kind.__name__}, got {value!r}")
+    if kind is str:
+        if value not in option.metadata["choices"]:
+            raise ValueError(
+                f"battle option {option.name} wants one of {option.metadata['choices']}, got {value!r}"
+            )
+        return value
     low, high = option.metadata.get("minimum", -_LARGEST), option.metadata.get("maximum", _LARGEST)
     if not low <= value <= high:
         raise ValueError(f"battle option {option.name} wants a value in [{low}, {high}], got {value!r}")

@@ -132,17 +132,30 @@ def _act_always(action, mask, actions):
 
 @inlined
 def _attack_closest(tables, battle, targets, actions):
-    """Attack the enemy nearest when the last one died, from any distance: availability does not bind it."""
+    """Attack the enemy nearest when the last one died, from any distance: availability does not bind it.
+
+    Healers treat the nearest hurt ally in the same way, and stop where there is none.
+    """
     n_allies = tables.rules[0].n_allies
     for i in range(n_allies):
         if not battle.units[i].alive:
             actions[i] = NO_OP
             continue
-        if targets[i] < 0 or not battle.units[n_allies + targets[i]].alive:
+        first = 0 if tables.specs[i].heals else n_allies
+        if targets[i] < 0 or not _is_worth(tables, battle, i, first + targets[i]):
+            targets[i] = -1
             nearest2 = np.inf
-            for j in range(tables.rules[0].n_enemies):
-                enemy = n_allies + j
-                distance2 = (battle.x[enemy] - battle.x[i]) ** 2 + (battle.y[enemy] - battle.y[i]) ** 2
-                if battle.units[enemy].alive and distance2 < nearest2:
-                    nearest2, targets[i] = distance2, j
-        actions[i] = FIRST_ATTACK + targets[i]
+            for j in range(first, n_allies if tables.specs[i].heals else len(battle.units)):
+                distance2 = (battle.x[j] - battle.x[i]) ** 2 + (battle.y[j] - battle.y[i]) ** 2
+                if distance2 < nearest2 and _is_worth(tables, battle, i, j):
+                    nearest2, targets[i] = distance2, j - first
+        actions[i] = FIRST_ATTACK + targets[i] if targets[i] >= 0 else STOP
+
+
+@inlined
+def _is_worth(tables, battle, i, j):
+    """Whether j is alive and one that i can do something about."""
+    unit, spec = battle.units[j], tables.specs[j]
+    if tables.specs[i].heals:
+        return unit.alive and not spec.heals and unit.health < spec.health
+    return unit.alive and tables.pairs[tables.specs[i].kind, spec.kind].damage > 0.0

@@ -6,13 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from liir_common.battle.parameters import resolve
 from liir_common.battle.tables import Battle, Tables, build_battle, build_tables
-
-MAP_SIZE = 32
 
 
 @dataclass(frozen=True)
@@ -32,40 +27,46 @@ class Scenario:
     name: str
     allies: tuple[Spawn, ...]
     enemies: tuple[Spawn, ...]
-    goal: tuple[float, float]
-    """Where the enemies' only order, an attack-move, leads."""
+    goal: tuple[float, float] | None
+    """Where the enemies' only order, an attack-move, leads; None leaves them where they start."""
     limit: int
     """Environment steps until the episode is truncated."""
     terrain: str
+    """One of `terrain.TERRAINS`"""
+    goal_end: tuple[float, float] | None = None
+    """The goal is a random point between `goal` and this one, drawn anew in every episode."""
+    hunts: bool = False
+    """The enemies' order is to attack the agents themselves; they attack-move nowhere."""
     ally_type_order: tuple[str, ...] = ()
     """Unit types in the order of the one-hot; empty where the map has a single type."""
     enemy_type_order: tuple[str, ...] = ()
+    uncertain: str = ""
+    """What no source settles about this map in particular, beside the parameters of all maps"""
 
+    @property
+    def n_allies(self) -> int:
+        """Agents."""
+        return sum(spawn.count for spawn in self.allies)
 
-def _arena(x0: int, x1: int, y0: int, y1: int, south: int = 0, north: int = 0) -> NDArray[np.bool_]:
-    """Cells x0 <= x < x1, y0 <= y < y1 without the triangles of those sizes at the corners."""
-    x, y = np.indices((MAP_SIZE, MAP_SIZE))
-    inside = (x0 <= x) & (x < x1) & (y0 <= y) & (y < y1)
-    from_side = np.minimum(x - x0, x1 - 1 - x)
-    return inside & (from_side + y - y0 >= south) & (from_side + y1 - 1 - y >= north)
+    @property
+    def n_enemies(self) -> int:
+        """Enemies; all SMAC v1 maps begin with everybody on the field."""
+        return sum(spawn.count for spawn in self.enemies)
 
-
-TERRAINS: Mapping[str, NDArray[np.bool_]] = {
-    "lane": _arena(2, 30, 7, 25),
-    "open": _arena(2, 30, 2, 30),
-    "rounded_square": _arena(7, 23, 7, 21, south=3, north=3),
-    "pentagon": _arena(7, 21, 7, 25, south=1, north=5),
-}
-"""[32, 32] by (x, y), true where ground units can stand."""
 
 _WEST, _EAST = (9.0, 16.0), (23.0, 16.0)
 
 
 def _facing(
-    name: str, allies: Mapping[str, int], enemies: Mapping[str, int], limit: int, terrain: str = "lane"
+    name: str,
+    allies: Mapping[str, int],
+    enemies: Mapping[str, int],
+    limit: int,
+    terrain: str = "lane",
+    uncertain: str = "",
 ) -> Scenario:
     """Allies in the west, enemies in the east and on their way to where the allies start."""
-    several = len(allies) > 1
+    bits = tuple(sorted(allies)) if len(allies) > 1 else ()
     return Scenario(
         name,
         allies=tuple(Spawn(unit, count, *_WEST) for unit, count in allies.items()),
@@ -73,15 +74,28 @@ def _facing(
         goal=_WEST,
         limit=limit,
         terrain=terrain,
-        # SMAC v1 numbers allied stalkers before zealots and enemy zealots before stalkers.
-        ally_type_order=("stalker", "zealot") if several else (),
-        enemy_type_order=("zealot", "stalker") if several else (),
+        ally_type_order=bits,
+        # SMAC v1 numbers by the ids of unit types: those of its own are in alphabetical order, but the game's
+        # zealot comes before its stalker, which shows where there is no third type.
+        enemy_type_order=("zealot", "stalker") if bits == ("stalker", "zealot") else bits,
+        uncertain=uncertain,
     )
 
 
 def _marines(name: str, allies: int, enemies: int, limit: int) -> Scenario:
     return _facing(name, {"marine": allies}, {"marine": enemies}, limit)
 
+
+_MEDIVACS = (
+    "what an enemy medivac does (medivac_follows), whether an agent's heals unasked (medivac_autocast), how "
+    "it slows down and turns (here at once)"
+)
+_BEAMS = (
+    "the direction in which beams sweep (inferred: across the shot) and whether an order cancels them "
+    "(new_order_cancels_hits)"
+)
+_BLASTS = "when a blast follows a death (here in the same loop)"
+_CROWD = "how a crowd keeps its places around a bend (hold_formation)"
 
 _SCENARIOS = (
     _marines("3m", 3, 3, limit=60),
@@ -97,6 +111,75 @@ _SCENARIOS = (
     _facing("3s_vs_3z", {"stalker": 3}, {"zealot": 3}, limit=150, terrain="open"),
     _facing("3s_vs_4z", {"stalker": 3}, {"zealot": 4}, limit=200, terrain="open"),
     _facing("3s_vs_5z", {"stalker": 3}, {"zealot": 5}, limit=250, terrain="open"),
+    _facing(
+        "1c3s5z",
+        {"colossus": 1, "stalker": 3, "zealot": 5},
+        {"colossus": 1, "stalker": 3, "zealot": 5},
+        limit=180,
+        uncertain=_BEAMS,
+    ),
+    _facing(
+        "MMM",
+        {"marine": 7, "marauder": 2, "medivac": 1},
+        {"marine": 7, "marauder": 2, "medivac": 1},
+        limit=150,
+        uncertain=_MEDIVACS,
+    ),
+    _facing(
+        "MMM2",
+        {"marine": 7, "marauder": 2, "medivac": 1},
+        {"marine": 8, "marauder": 3, "medivac": 1},
+        limit=180,
+        uncertain=_MEDIVACS,
+    ),
+    Scenario(
+        "2m_vs_1z",
+        allies=(Spawn("marine", 1, 13, 12), Spawn("marine", 1, 19, 12)),
+        enemies=(Spawn("zealot", 1, 16, 19),),
+        goal=(13, 12),
+        goal_end=(19, 12),
+        limit=150,
+        terrain="octagon",
+    ),
+    Scenario(
+        "corridor",
+        allies=(Spawn("zealot", 6, 19.0397, 19.1198),),
+        enemies=(Spawn("zergling", 24, 27.91, 28.24),),
+        goal=(4.47, 4.3298),
+        limit=400,
+        terrain="corridor",
+        uncertain=_CROWD,
+    ),
+    Scenario(
+        "so_many_baneling",
+        allies=(Spawn("zealot", 7, 11.469, 12.0234),),
+        enemies=(Spawn("baneling", 32, 27.91, 28.24),),
+        goal=(4.47, 4.3298),
+        limit=100,
+        terrain="baneling_path",
+        uncertain=f"{_CROWD}; {_BLASTS}",
+    ),
+    Scenario(
+        "bane_vs_bane",
+        allies=(Spawn("zergling", 20, 16, 11), Spawn("baneling", 4, 16, 8)),
+        enemies=(Spawn("zergling", 20, 16, 21), Spawn("baneling", 4, 16, 24)),
+        goal=(16, 8),
+        limit=200,
+        terrain="octagon",
+        ally_type_order=("baneling", "zergling"),
+        enemy_type_order=("baneling", "zergling"),
+        uncertain=_BLASTS,
+    ),
+    Scenario(
+        "2c_vs_64zg",
+        allies=(Spawn("colossus", 1, 16, 16), Spawn("colossus", 1, 16, 16)),
+        enemies=(Spawn("zergling", 64, 16, 9),),
+        goal=None,
+        hunts=True,
+        limit=400,
+        terrain="ravine",
+        uncertain=f"{_BEAMS}; which colossus a zergling is sent to (hunt_nearest)",
+    ),
     Scenario(
         "6h_vs_8z",
         allies=(Spawn("hydralisk", 6, 14.5998, 9.49),),
@@ -105,14 +188,14 @@ _SCENARIOS = (
         limit=150,
         terrain="rounded_square",
     ),
-    # The spine crawler has no order in the game; its goal here is where it stands.
     Scenario(
         "2s_vs_1sc",
         allies=(Spawn("stalker", 1, 11.1208, 10.338), Spawn("stalker", 1, 16.976, 10.3662)),
         enemies=(Spawn("spine_crawler", 1, 13.92, 20.0397),),
-        goal=(13.92, 20.0397),
+        goal=None,
         limit=300,
         terrain="pentagon",
+        uncertain="how long the crawler's tentacle takes (here none)",
     ),
 )
 
@@ -136,6 +219,5 @@ def make_battle(map_name: str, **options: Any) -> tuple[Tables, Battle]:
     Raises:
         ValueError: an unknown map or option, or an illegal value.
     """
-    scenario = find_scenario(map_name)
-    tables = build_tables(scenario, resolve(options), TERRAINS[scenario.terrain])
+    tables = build_tables(find_scenario(map_name), resolve(options))
     return tables, build_battle(tables)

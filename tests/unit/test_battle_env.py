@@ -41,7 +41,7 @@ def play_randomly(env: BattleEnv, seed: int) -> tuple[list[Any], dict[str, dict[
     return seen, infos
 
 
-@pytest.mark.parametrize("map_name", ["3m", "8m", "2s3z"])
+@pytest.mark.parametrize("map_name", SCENARIOS)
 def test_same_seed_and_actions_same_bytes(map_name: str) -> None:
     env = parallel_env(map_name)
     first = play_randomly(env, 7)[0]
@@ -125,7 +125,9 @@ def test_no_step_after_the_end() -> None:
         ("3m", {"reward_win": "big"}, "reward_win wants float, got 'big'"),
         ("3m", {"reward_win": float("nan")}, "reward_win wants a value in"),
         ("3m", {"reward_scale_rate": 0}, "reward_scale_rate wants a value in"),
-        ("3m", {"order_latency": 8}, r"order_latency wants a value in \[0, 7\], got 8"),
+        ("3m", {"order_latency": 8}, "order_latency wants to be less than step_mul, got 8 and 8"),
+        ("3m", {"balance": "beta"}, "balance wants one of .*base_liberty.*, got 'beta'"),
+        ("3m", {"balance": 1}, "balance wants str, got 1"),
     ],
 )
 @pytest.mark.parametrize("make", [parallel_env, battle_spec, make_battle])

@@ -14,7 +14,8 @@ from liir_common.battle.env import BattleEnv, UnitRecord, parallel_env
 from liir_common.battle.parameters import Parameters, Settings
 from liir_common.battle.policies import CLOSEST_ENEMY, RANDOM
 from liir_common.battle.policies import play as play_policy
-from liir_common.battle.scenarios import TERRAINS, make_battle
+from liir_common.battle.scenarios import make_battle
+from liir_common.battle.terrain import TERRAINS
 
 STOP, NORTH, SOUTH, EAST, WEST, ATTACK = range(1, 7)
 FAR = {"x": 29.0, "y": 24.0}
@@ -348,12 +349,12 @@ def test_a_spine_crawler_stays_and_reaches_far() -> None:
 
 
 def test_terrains_have_cut_corners() -> None:
-    pentagon = TERRAINS["pentagon"]
+    pentagon = TERRAINS["pentagon"].pathing
     assert np.flatnonzero(pentagon[:, 24]).tolist() == [12, 13, 14, 15]
     assert np.flatnonzero(pentagon[:, 19]).tolist() == list(range(7, 21))
     assert np.flatnonzero(pentagon[:, 7]).tolist() == list(range(8, 20))
-    assert TERRAINS["rounded_square"].sum() == 16 * 14 - 4 * 6
-    assert TERRAINS["lane"].sum() == 28 * 18
+    assert TERRAINS["rounded_square"].pathing.sum() == 16 * 14 - 4 * 6
+    assert TERRAINS["lane"].pathing.sum() == 28 * 18
 
 
 CHANGED: dict[str, Any] = {

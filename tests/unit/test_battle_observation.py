@@ -8,17 +8,43 @@ import numpy as np
 import pytest
 
 from liir_common.battle.env import BattleEnv, UnitRecord, battle_spec, parallel_env
-from liir_common.battle.scenarios import SCENARIOS, TERRAINS
+from liir_common.battle.scenarios import SCENARIOS
+from liir_common.battle.terrain import TERRAINS
 
 SIGHT, SHOOT_RANGE = 9.0, 6.0
-COOLDOWN_MAX = {"marine": 15, "stalker": 35, "zealot": 22, "hydralisk": 10, "spine_crawler": 15}
-ALLY_BITS = {"stalker": 0, "zealot": 1}
-ENEMY_BITS = {"zealot": 0, "stalker": 1}
+COOLDOWN_MAX = {
+    "marine": 15,
+    "marauder": 25,
+    "stalker": 35,
+    "zealot": 22,
+    "colossus": 24,
+    "hydralisk": 10,
+    "zergling": 11,
+    "baneling": 1,
+}
+ENERGY_MAX = 200
+STALKERS_AND_ZEALOTS = {"ally": ["stalker", "zealot"], "enemy": ["zealot", "stalker"]}
+COLOSSI = {key: ["colossus", "stalker", "zealot"] for key in ("ally", "enemy")}
+MMM = {key: ["marauder", "marine", "medivac"] for key in ("ally", "enemy")}
+BANE = {key: ["baneling", "zergling"] for key in ("ally", "enemy")}
+BITS = {
+    "2s3z": STALKERS_AND_ZEALOTS,
+    "3s5z": STALKERS_AND_ZEALOTS,
+    "3s5z_vs_3s6z": STALKERS_AND_ZEALOTS,
+    "1c3s5z": COLOSSI,
+    "MMM": MMM,
+    "MMM2": MMM,
+    "bane_vs_bane": BANE,
+}
+HEIGHTS = {0.0: 175, 1.0: 191, 1.25: 195, 1.5: 199, 1.75: 203, 2.0: 207}
+"""Bytes of the game's API by cliff level."""
 DEFAULTS: dict[str, Any] = {
     "obs_all_health": True,
     "obs_own_health": True,
     "obs_last_action": False,
     "obs_pathing_grid": False,
+    "obs_terrain_height": False,
+    "move_amount": 2.0,
     "obs_timestep_number": False,
     "obs_instead_of_state": False,
     "state_last_action": True,
@@ -28,10 +54,10 @@ OPTIONS: tuple[dict[str, Any], ...] = (
     {},
     {"state_last_action": False, "state_timestep_number": True},
     {"obs_last_action": True, "obs_timestep_number": True, "obs_pathing_grid": True},
+    {"obs_terrain_height": True, "obs_pathing_grid": True, "move_amount": 5.0},
     {"obs_all_health": False},
     {"obs_all_health": False, "obs_own_health": False, "obs_instead_of_state": True},
 )
-MAPS = ("3m", "5m_vs_6m", "8m", "2s3z", "3s5z", "3s_vs_4z", "6h_vs_8z", "2s_vs_1sc")
 
 
 class Reference:
@@ -41,36 +67,46 @@ class Reference:
         self.scenario = SCENARIOS[map_name]
         self.options = DEFAULTS | options
         self.options["obs_own_health"] |= self.options["obs_all_health"]
-        self.pathing = TERRAINS[self.scenario.terrain]
-        self.mixed = map_name in ("2s3z", "3s5z")
+        self.pathing = TERRAINS[self.scenario.terrain].pathing
+        self.level = TERRAINS[self.scenario.terrain].level
+        self.bits = BITS.get(map_name)
 
     def is_open(self, x: int, y: int, outside: bool) -> bool:
         inside = 0 <= x < 32 and 0 <= y < 32
         return bool(self.pathing[x, y]) if inside else outside
 
-    def mask(self, me: UnitRecord, enemies: list[UnitRecord]) -> list[bool]:
+    def height(self, x: int, y: int) -> float:
+        return HEIGHTS[self.level[x, y]] / 255 if 0 <= x < 32 and 0 <= y < 32 else 1.0
+
+    def mask(self, me: UnitRecord, units: list[UnitRecord]) -> list[bool]:
+        enemies = [unit for unit in units if unit["team"] == "enemy"]
         if not me["alive"]:
             return [True] + [False] * (5 + len(enemies))
-        x, y = me["x"], me["y"]
+        x, y, ahead = me["x"], me["y"], self.options["move_amount"] / 2
         moves = [
-            self.is_open(int(x), int(y + 1), False),
-            self.is_open(int(x), int(y - 1), False),
-            self.is_open(int(x + 1), int(y), False),
-            self.is_open(int(x - 1), int(y), False),
+            self.is_open(int(x), int(y + ahead), False),
+            self.is_open(int(x), int(y - ahead), False),
+            self.is_open(int(x + ahead), int(y), False),
+            self.is_open(int(x - ahead), int(y), False),
         ]
-        attacks = [e["alive"] and np.hypot(e["x"] - x, e["y"] - y) <= SHOOT_RANGE for e in enemies]
+        attacks = [self.in_range(me, enemy) for enemy in enemies]
+        if me["unit_type"] == "medivac":
+            allies = [unit for unit in units if unit["team"] == "ally"]
+            attacks = [u["unit_type"] != "medivac" and self.in_range(me, u) for u in allies]
+            attacks += [False] * (len(enemies) - len(allies))
         return [False, True, *moves, *attacks]
+
+    def in_range(self, me: UnitRecord, other: UnitRecord) -> bool:
+        gap = np.hypot(other["x"] - me["x"], other["y"] - me["y"])
+        return bool(other["alive"] and gap <= SHOOT_RANGE)
 
     def health(self, unit: UnitRecord, shields: bool) -> list[float]:
         values = [unit["health"] / unit["health_max"]]
         return [*values, unit["shield"] / unit["shield_max"]] if shields else values
 
     def type_bits(self, unit: UnitRecord) -> list[float]:
-        if not self.mixed:
-            return []
-        bits = [0.0, 0.0]
-        bits[(ALLY_BITS if unit["team"] == "ally" else ENEMY_BITS)[unit["unit_type"]]] = 1.0
-        return bits
+        names = self.bits[unit["team"]] if self.bits else []
+        return [float(name == unit["unit_type"]) for name in names]
 
     def seen(self, me: UnitRecord, other: UnitRecord, first: float, tail: list[float]) -> list[float]:
         dx, dy = other["x"] - me["x"], other["y"] - me["y"]
@@ -87,12 +123,14 @@ class Reference:
         allies = [u for u in units if u["team"] == "ally"]
         enemies = [u for u in units if u["team"] == "enemy"]
         me = allies[i]
-        mask = self.mask(me, enemies)
+        mask = self.mask(me, units)
         values = [float(v) for v in mask[2:6]]
+        x, y = int(me["x"]), int(me["y"])
+        around = [(0, 4), (0, -4), (4, 0), (-4, 0), (2, 2), (-2, -2), (2, -2), (-2, 2)]
         if self.options["obs_pathing_grid"]:
-            x, y = int(me["x"]), int(me["y"])
-            around = [(0, 4), (0, -4), (4, 0), (-4, 0), (2, 2), (-2, -2), (2, -2), (-2, 2)]
             values += [float(self.is_open(x + dx, y + dy, True)) for dx, dy in around]
+        if self.options["obs_terrain_height"]:
+            values += [self.height(x + dx, y + dy) for dx, dy in [*around, (0, 0)]]
         for j, enemy in enumerate(enemies):
             values += self.seen(me, enemy, float(mask[6 + j]), [])
         for j, ally in enumerate(allies):
@@ -111,7 +149,10 @@ class Reference:
         for unit in units:
             row = [unit["health"] / unit["health_max"]]
             if unit["team"] == "ally":
-                row.append(unit["cooldown"] / COOLDOWN_MAX[unit["unit_type"]])
+                if unit["unit_type"] == "medivac":
+                    row.append(unit["energy"] / ENERGY_MAX)
+                else:
+                    row.append(unit["cooldown"] / COOLDOWN_MAX[unit["unit_type"]])
             row += [(unit["x"] - 16) / 32, (unit["y"] - 16) / 32]
             if unit["shield_max"]:
                 row.append(unit["shield"] / unit["shield_max"])
@@ -125,14 +166,16 @@ class Reference:
 def scatter(env: BattleEnv, rng: np.random.Generator) -> None:
     """Put all units somewhere, near enough to each other that many are in sight."""
     records = env.snapshot()
-    pathing = env._tables.pathing
-    for record in records:
-        while not pathing[int(record["x"]), int(record["y"])] or rng.random() < 0.5:
-            record["x"], record["y"] = rng.uniform(2, 20), rng.uniform(4, 26)
+    for record, spec in zip(records, env._tables.specs, strict=True):
+        cells = env._tables.layers[spec["layer"]]
+        while not cells[int(record["x"]), int(record["y"])] or rng.random() < 0.5:
+            record["x"], record["y"] = rng.uniform(2, 22), rng.uniform(4, 26)
         alive = bool(rng.random() < 0.8)
         record["alive"] = alive
         record["health"] = float(rng.integers(1, int(record["health_max"]))) if alive else 0.0
         record["shield"] = float(rng.uniform(0, record["shield_max"])) if alive else 0.0
+        if record["unit_type"] == "medivac":
+            record["energy"] = float(rng.uniform(0, ENERGY_MAX))
         record["cooldown"] = float(rng.choice([0.0, rng.uniform(0, 40)]))
     for team in (records[0], records[-1]):
         team["alive"], team["health"] = True, 7.0
@@ -140,11 +183,11 @@ def scatter(env: BattleEnv, rng: np.random.Generator) -> None:
 
 
 @pytest.mark.parametrize("options", OPTIONS, ids=lambda options: "-".join(options) or "default")
-@pytest.mark.parametrize("map_name", MAPS)
+@pytest.mark.parametrize("map_name", SCENARIOS)
 def test_layout(map_name: str, options: dict[str, Any]) -> None:
     env, reference = parallel_env(map_name, **options), Reference(map_name, options)
     spec, rng = battle_spec(map_name, **options), np.random.default_rng(3)
-    for episode in range(12):
+    for episode in range(8 if spec.n_agents < 12 else 2):
         observations, _ = env.reset(seed=episode)
         last_actions = np.zeros((spec.n_agents, spec.n_actions))
         steps = 0
@@ -155,13 +198,12 @@ def test_layout(map_name: str, options: dict[str, Any]) -> None:
             steps += 1
         scatter(env, rng)
         observations, units = env._observations(), env.snapshot()
-        enemies = [unit for unit in units if unit["team"] == "enemy"]
         share = steps / spec.episode_limit
         rows = [reference.observation(units, i, last_actions, share) for i in range(spec.n_agents)]
         for i, agent in enumerate(env.agents):
             assert observations[agent]["observation"].shape == (spec.obs_dim,)
             np.testing.assert_allclose(observations[agent]["observation"], rows[i], atol=1e-6)
-            assert observations[agent]["action_mask"].tolist() == reference.mask(units[i], enemies)
+            assert observations[agent]["action_mask"].tolist() == reference.mask(units[i], units)
         state = np.concatenate(rows) if options.get("obs_instead_of_state") else None
         wanted = reference.state(units, last_actions, share) if state is None else state
         assert env.state().shape == (spec.state_dim,)
@@ -182,6 +224,14 @@ def test_layout(map_name: str, options: dict[str, Any]) -> None:
         ("3s5z", 14, 128, 216, 104),
         ("3s5z_vs_3s6z", 15, 136, 230, 110),
         ("3s_vs_3z", 9, 36, 54, 27),
+        ("MMM", 16, 160, 290, 130),
+        ("MMM2", 18, 176, 322, 142),
+        ("1c3s5z", 15, 162, 270, 135),
+        ("2m_vs_1z", 7, 16, 26, 12),
+        ("corridor", 30, 156, 282, 102),
+        ("so_many_baneling", 38, 202, 397, 131),
+        ("bane_vs_bane", 30, 336, 984, 264),
+        ("2c_vs_64zg", 70, 332, 342, 202),
         ("3s_vs_4z", 10, 42, 61, 31),
         ("3s_vs_5z", 11, 48, 68, 35),
         ("6h_vs_8z", 14, 78, 140, 56),
@@ -196,8 +246,9 @@ def test_sizes_are_those_of_smac(
     assert battle_spec(map_name, state_last_action=False).state_dim == state_without
 
 
-def test_allies_are_in_the_order_of_smac() -> None:
-    env = parallel_env("3s5z")
+@pytest.mark.parametrize("map_name", SCENARIOS)
+def test_allies_are_in_the_order_of_smac(map_name: str) -> None:
+    env = parallel_env(map_name)
     env.reset(seed=0)
     allies = [(u["unit_type"], u["x"], u["y"]) for u in env.snapshot() if u["team"] == "ally"]
     assert allies == sorted(allies)

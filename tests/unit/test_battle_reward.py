@@ -110,7 +110,24 @@ def test_against_the_slow_one(map_name: str, options: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("map_name", "divisor"), [("3m", 18.25), ("8m", 32), ("2s3z", 51), ("3s5z", 75.5), ("27m_vs_30m", 92.5)]
+    ("map_name", "divisor"),
+    [
+        ("3m", 18.25),
+        ("8m", 32),
+        ("2s3z", 51),
+        ("3s5z", 75.5),
+        ("27m_vs_30m", 92.5),
+        ("MMM", 50.75),
+        ("MMM2", 60.25),
+        ("1c3s5z", 93.5),
+        ("2m_vs_1z", 18),
+        ("corridor", 64),
+        ("so_many_baneling", 74),
+        ("bane_vs_bane", 63),
+        ("2c_vs_64zg", 154),
+        ("2s_vs_1sc", 25.5),
+        ("6h_vs_8z", 74),
+    ],
 )
 def test_divisors_are_those_of_smac(map_name: str, divisor: float) -> None:
     assert parallel_env(map_name)._tables.rules["reward_divisor"][0] == divisor

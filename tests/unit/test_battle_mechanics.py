@@ -12,10 +12,10 @@ import pytest
 
 from liir_common.battle.env import BattleEnv, UnitRecord, parallel_env
 from liir_common.battle.parameters import Parameters, Settings
-from liir_common.battle.policies import CLOSEST_ENEMY, RANDOM
+from liir_common.battle.policies import CLOSEST_ENEMY, RANDOM, STAND
 from liir_common.battle.policies import play as play_policy
 from liir_common.battle.scenarios import make_battle
-from liir_common.battle.terrain import TERRAINS
+from liir_common.battle.terrain import MAP_SIZE, TERRAINS, routes
 
 STOP, NORTH, SOUTH, EAST, WEST, ATTACK = range(1, 7)
 FAR = {"x": 29.0, "y": 24.0}
@@ -28,7 +28,7 @@ def stage(env: BattleEnv, changes: Mapping[tuple[str, int], Mapping[str, Any]], 
     for record in records:
         key = (record["team"], record["id"])
         if key in changes:
-            record.update({"order": "idle", **changes[key]})  # type: ignore[typeddict-item]
+            record.update({"order": "idle", "target": None, **changes[key]})  # type: ignore[typeddict-item]
         else:
             record.update({"alive": False, "health": 0.0, "shield": 0.0})  # type: ignore[typeddict-item]
     env.restore(records)
@@ -348,6 +348,282 @@ def test_a_spine_crawler_stays_and_reaches_far() -> None:
     assert (unit(env, "enemy", 0)["x"], unit(env, "enemy", 0)["y"]) == (13.92, 20.0397)
 
 
+MEDIVAC = 9
+"""The number of the medivac in both teams of MMM; 0 and 1 are marauders, from 2 on marines, among allies."""
+
+
+def test_a_medivac_heals_for_energy() -> None:
+    """9 points of life per second at 0.33 energy each, while 0.5625 energy per second come back."""
+    env = parallel_env("MMM")
+    medivac, hurt = {"x": 10.0, "y": 15.0, "energy": 50.0}, {"x": 12.0, "y": 15.0, "health": 20.0}
+    stage(env, {("ally", MEDIVAC): medivac, ("ally", 4): hurt, ("enemy", 0): FAR})
+    play(env, {MEDIVAC: ATTACK + 4}, steps=4)
+    loops = 4 * 8 - 1
+    assert unit(env, "ally", 4)["health"] == pytest.approx(20 + loops * 9 / 16)
+    spent = loops * 9 / 16 * 0.33
+    assert unit(env, "ally", MEDIVAC)["energy"] == pytest.approx(50 - spent + 32 * 0.5625 / 16)
+    assert unit(env, "ally", MEDIVAC)["target"] == 4
+
+
+def test_healing_ends_with_the_energy_and_at_full_health() -> None:
+    env = parallel_env("MMM")
+    medivac, hurt = {"x": 10.0, "y": 15.0, "energy": 1.0}, {"x": 12.0, "y": 15.0, "health": 20.0}
+    stage(env, {("ally", MEDIVAC): medivac, ("ally", 4): hurt, ("enemy", 0): FAR})
+    play(env, {MEDIVAC: ATTACK + 4}, steps=8)
+    assert unit(env, "ally", 4)["health"] == pytest.approx(20 + (1 + 64 * 0.5625 / 16) / 0.33, abs=0.2)
+    medivac["energy"], hurt["health"] = 50.0, 44.0
+    stage(env, {("ally", MEDIVAC): medivac, ("ally", 4): hurt, ("enemy", 0): FAR})
+    play(env, {MEDIVAC: ATTACK + 4}, steps=8)
+    assert unit(env, "ally", 4)["health"] == 45.0
+
+
+def test_a_medivac_flies_up_slowly_and_over_others() -> None:
+    """It reaches 4 beyond the radii, takes 19 loops to full speed, and pushes nobody."""
+    env = parallel_env("MMM")
+    hurt = {"x": 20.0, "y": 15.0, "health": 5.0}
+    between = {"x": 12.0, "y": 15.0}
+    medivac = {"x": 10.0, "y": 15.0, "energy": 50.0}
+    stage(env, {("ally", MEDIVAC): medivac, ("ally", 4): hurt, ("ally", 5): between, ("enemy", 0): FAR})
+    env._masks[MEDIVAC, ATTACK + 4] = True
+    play(env, {MEDIVAC: ATTACK + 4})
+    paces = sum(min(2.75 / 16, k * 2.3125 / 256) for k in range(1, 8))
+    assert unit(env, "ally", MEDIVAC)["x"] == pytest.approx(10 + paces)
+    for _ in range(5):
+        env._masks[MEDIVAC, ATTACK + 4] = True
+        play(env, {MEDIVAC: ATTACK + 4})
+    assert distance(unit(env, "ally", MEDIVAC), unit(env, "ally", 4)) <= 4 + 0.75 + 0.375
+    assert unit(env, "ally", 5)["y"] == 15.0
+    assert unit(env, "ally", 4)["health"] > 5.0
+
+
+def test_an_enemy_medivac_treats_the_worst_hurt_of_its_own_accord() -> None:
+    env = parallel_env("MMM")
+    medivac = {"x": 20.0, "y": 15.0, "order": "attack_move"}
+    stage(
+        env,
+        {
+            ("ally", 0): {"x": 3.0, "y": 8.0},
+            ("enemy", MEDIVAC): medivac,
+            ("enemy", 0): {"x": 21.0, "y": 15.0, "health": 30.0},
+            ("enemy", 1): {"x": 23.0, "y": 15.0, "health": 10.0},
+        },
+    )
+    play(env, {})
+    assert unit(env, "enemy", MEDIVAC)["target"] == 1
+    assert unit(env, "enemy", 1)["health"] == pytest.approx(10 + 8 * 9 / 16)
+    assert unit(env, "enemy", 0)["health"] == 30.0
+
+
+@pytest.mark.parametrize("autocast", [False, True])
+def test_an_agents_medivac_is_as_passive_as_the_others(autocast: bool) -> None:
+    env = parallel_env("MMM", medivac_autocast=autocast)
+    hurt = {"x": 12.0, "y": 15.0, "health": 20.0}
+    medivac = {"x": 10.0, "y": 15.0, "energy": 50.0}
+    stage(env, {("ally", MEDIVAC): medivac, ("ally", 4): hurt, ("enemy", 0): FAR})
+    play(env, {})
+    assert (unit(env, "ally", 4)["health"] > 20.0) is autocast
+
+
+def test_marauders_cannot_hit_what_flies_and_marines_can() -> None:
+    env = parallel_env("MMM")
+    flying = {"x": 14.0, "y": 15.0}
+    stage(env, {("ally", 0): {"x": 10.0, "y": 15.0}, ("enemy", MEDIVAC): flying, ("enemy", 0): FAR})
+    play(env, {0: ATTACK + MEDIVAC}, steps=3)
+    assert unit(env, "enemy", MEDIVAC)["health"] == 150.0
+    stage(env, {("ally", 2): {"x": 10.0, "y": 15.0}, ("enemy", MEDIVAC): flying, ("enemy", 0): FAR})
+    play(env, {2: ATTACK + MEDIVAC})
+    assert unit(env, "enemy", MEDIVAC)["health"] == 150.0 - 5
+
+
+@pytest.mark.parametrize(
+    ("left", "won", "over"),
+    [
+        ([("ally", MEDIVAC), ("enemy", 0)], 0, True),
+        ([("ally", 0), ("enemy", MEDIVAC)], 1, True),
+        ([("ally", MEDIVAC), ("enemy", MEDIVAC)], 0, True),
+        ([("ally", 0), ("enemy", 0)], 0, False),
+    ],
+    ids=["only our medivac", "only theirs", "only medivacs", "fighters"],
+)
+def test_medivacs_alone_are_beaten(left: list[tuple[str, int]], won: int, over: bool) -> None:
+    env = parallel_env("MMM")
+    places = ({"x": 4.0, "y": 9.0}, {"x": 28.0, "y": 23.0})
+    stage(env, dict(zip(left, places, strict=True)))
+    infos = play(env, {})
+    assert (not env.agents) is over
+    assert infos["ally_0"].get("won", 0) == won
+
+
+def test_beams_sweep_across_the_shot() -> None:
+    """Two beams of 10 + 5 on light units: the target and what stands beside it within the beams' length."""
+    env = parallel_env("2c_vs_64zg")
+    at = {0: (16.0, 10.0), 1: (16.8, 10.0), 2: (14.9, 10.0), 3: (18.0, 10.0), 4: (16.0, 9.2)}
+    changes: dict[tuple[str, int], dict[str, Any]] = {
+        ("enemy", k): {"x": x, "y": y} for k, (x, y) in at.items()
+    }
+    stage(env, {("ally", 0): {"x": 16.0, "y": 15.0}, **changes})
+    play(env, {0: ATTACK}, steps=2)
+    lost = {k: 35 - unit(env, "enemy", k)["health"] for k in at}
+    # Zerglings win back a little of it.
+    assert lost == pytest.approx({0: 30, 1: 30, 2: 30, 3: 0, 4: 0}, abs=0.3)
+    assert lost[3] == lost[4] == 0
+
+
+def test_beams_spare_friends() -> None:
+    env = parallel_env("1c3s5z")
+    friend = {"x": 13.0, "y": 16.0}
+    stage(
+        env,
+        {
+            ("ally", 0): {"x": 8.0, "y": 15.0},
+            ("ally", 4): friend,
+            ("enemy", 4): {"x": 13.0, "y": 15.0},
+            ("enemy", 5): {"x": 13.0, "y": 14.0},
+        },
+    )
+    play(env, {0: ATTACK + 4}, steps=2)
+    assert unit(env, "ally", 4)["shield"] == 50
+    assert [unit(env, "enemy", k)["shield"] for k in (4, 5)] == [20, 20]
+
+
+def test_colossi_cross_the_cliff_and_zerglings_go_around() -> None:
+    env = parallel_env("2c_vs_64zg")
+    far = {"x": 28.5, "y": 8.0}
+    stage(env, {("ally", 0): {"x": 16.0, "y": 15.1}, ("enemy", 0): far})
+    play(env, {0: SOUTH}, steps=3)
+    assert unit(env, "ally", 0)["y"] == pytest.approx(15.1 - 23 * 2.25 / 16)
+    stage(env, {("ally", 0): {"x": 16.0, "y": 15.0}, ("enemy", 0): {"x": 16.0, "y": 10.0, "order": "attack"}})
+    env._battle.units["target"][2] = 0
+    trail = []
+    while unit(env, "ally", 0)["shield"] == 150 and len(trail) < 40:
+        play(env, {})
+        trail.append((unit(env, "enemy", 0)["x"], unit(env, "enemy", 0)["y"]))
+    assert max(abs(x - 16) for x, _ in trail) > 11.5, "over a ramp"
+    assert unit(env, "ally", 0)["shield"] < 150
+
+
+def test_the_whole_pack_reaches_its_prey() -> None:
+    """64 zerglings from below the cliff; two colossi that stand are dead long before the limit."""
+    outcomes = play_policy(make_battle("2c_vs_64zg")[0], STAND, episodes=20)
+    assert (outcomes[:, 3] == 2).all()
+    assert outcomes[:, 0].max() < 60
+
+
+@pytest.mark.parametrize("terrain", TERRAINS)
+def test_routes_lead_everywhere(terrain: str) -> None:
+    """From any open cell to any other in a few bends; straight where the table is silent."""
+    table, cells = routes(terrain), np.flatnonzero(TERRAINS[terrain].pathing)
+    assert bool(table.size) is TERRAINS[terrain].has_obstacles
+    if not table.size:
+        return
+    for goal in cells[::5]:
+        at = cells.copy()
+        for _ in range(6):
+            bend = table[at, goal]
+            at = np.where(bend < 0, at, bend)
+        assert (table[at, goal] < 0).all()
+
+
+def walks_straight(terrain: str) -> bool:
+    """Whether every straight way between open cells stays on open ground: what convex means."""
+    pathing = TERRAINS[terrain].pathing
+    cells = np.argwhere(pathing)[::3] + 0.5
+    shares = np.linspace(0, 1, MAP_SIZE)[:, None, None, None]
+    ways = (cells[None, :, None] + shares * (cells[None, None] - cells[None, :, None])).astype(int)
+    return bool(pathing[ways[..., 0], ways[..., 1]].all())
+
+
+@pytest.mark.parametrize("terrain", TERRAINS)
+def test_obstacles_are_where_straight_ways_fail(terrain: str) -> None:
+    assert walks_straight(terrain) is not TERRAINS[terrain].has_obstacles
+
+
+def test_a_baneling_bursts_among_its_enemies_only() -> None:
+    """35 on light units within 2.2 of its centre and their own radius; it dies, its friends do not."""
+    env = parallel_env("bane_vs_bane")
+    stage(
+        env,
+        {
+            ("ally", 0): {"x": 16.0, "y": 15.0},
+            ("ally", 5): {"x": 15.2, "y": 15.0},
+            ("enemy", 0): {"x": 16.8, "y": 15.0, "health": 20.0},
+            ("enemy", 1): {"x": 16.0, "y": 17.5, "health": 35.0},
+            ("enemy", 2): {"x": 16.0, "y": 12.3, "health": 35.0},
+            ("enemy", 20): {"x": 18.0, "y": 15.0, "health": 30.0},
+        },
+    )
+    play(env, {0: ATTACK})
+    assert not unit(env, "ally", 0)["alive"]
+    assert unit(env, "ally", 5)["health"] == 35
+    # Zerglings are light, banelings are not: 35 and 20.
+    assert [unit(env, "enemy", k)["alive"] for k in (0, 1, 2, 20)] == [False, False, True, True]
+    assert unit(env, "enemy", 20)["health"] == pytest.approx(10, abs=0.2)
+
+
+def test_a_baneling_that_is_killed_bursts_too() -> None:
+    """And what its blast kills bursts in turn."""
+    env = parallel_env("bane_vs_bane")
+    stage(
+        env,
+        {
+            ("ally", 4): {"x": 16.0, "y": 15.0},
+            ("ally", 0): {"x": 17.0, "y": 16.0, "health": 15.0},
+            ("ally", 6): {"x": 22.0, "y": 15.0},
+            ("enemy", 20): {"x": 16.85, "y": 15.0, "health": 4.0},
+            ("enemy", 3): {"x": 17.5, "y": 17.5},
+            ("enemy", 4): {"x": 24.0, "y": 20.0},
+        },
+    )
+    play(env, {4: ATTACK + 20})
+    assert not unit(env, "enemy", 20)["alive"]
+    assert not unit(env, "ally", 4)["alive"], "in the blast"
+    assert not unit(env, "ally", 0)["alive"], "in the blast"
+    assert not unit(env, "enemy", 3)["alive"], "in the blast of the baneling that the blast killed"
+    assert unit(env, "ally", 6)["alive"]
+
+
+def test_zerglings_bite_every_eleven_loops() -> None:
+    """Period 0.696 s and a random delay of -1 to 2 loops: 0.5 loop on average, and half a loop of waiting."""
+    env = parallel_env("bane_vs_bane")
+    bites = 0
+    for seed in range(40):
+        stage(env, {("ally", 4): {"x": 16.0, "y": 15.0}, ("enemy", 0): {"x": 16.8, "y": 15.0}}, seed)
+        for _ in range(60):
+            play(env, {4: ATTACK})
+            bites += round((35 - unit(env, "enemy", 0)["health"]) / 5)
+            env._battle.units["health"][24] = 35.0
+    assert bites / 40 == pytest.approx(480 / (0.696 * 16 + 0.5 + 0.5), rel=0.02)
+
+
+def test_the_zealot_of_2m_vs_1z_walks_to_a_random_point_between_the_marines() -> None:
+    env, goals = parallel_env("2m_vs_1z"), []
+    for seed in range(200):
+        env.reset(seed=seed)
+        goals.append((env._battle.units["goal_x"][2], env._battle.units["goal_y"][2]))
+    xs = np.array(goals)[:, 0]
+    assert 13 <= xs.min() < 13.3
+    assert 18.7 < xs.max() <= 19
+    assert {y for _, y in goals} == {12.0}
+
+
+def test_base_liberty_has_the_weapons_that_the_archives_name() -> None:
+    lost = {}
+    for balance in ("multiplayer", "base_liberty"):
+        env = parallel_env("3s_vs_3z", balance=balance)
+        stage(env, {("ally", 0): {"x": 10.0, "y": 15.0}, ("enemy", 0): {"x": 14.0, "y": 15.0}})
+        play(env, {0: ATTACK}, steps=2)
+        lost[balance] = 50 - unit(env, "enemy", 0)["shield"]
+    assert lost == {"multiplayer": 13, "base_liberty": 10}
+
+
+def test_longer_steps_and_moves() -> None:
+    env = parallel_env("3m", step_mul=16, move_amount=1.0)
+    stage(env, {("ally", 0): {"x": 15.0, "y": 15.0}, ("enemy", 0): FAR})
+    play(env, {0: EAST})
+    assert unit(env, "ally", 0)["x"] == pytest.approx(16.0), "where the order led"
+    assert env._battle.clock[0] == 2 + 16
+
+
 def test_terrains_have_cut_corners() -> None:
     pentagon = TERRAINS["pentagon"].pathing
     assert np.flatnonzero(pentagon[:, 24]).tolist() == [12, 13, 14, 15]
@@ -364,19 +640,20 @@ CHANGED: dict[str, Any] = {
     "rescan_period": 1,
     "redirect_missiles": True,
     "cooldown_from_release": True,
+    "balance": "base_liberty",
 }
 
 
 @pytest.mark.parametrize("name", [field.name for field in fields(Parameters)])
 def test_every_parameter_matters(name: str) -> None:
-    """In some battle of two maps; what it does has tests above, or none if it only moves the statistics."""
+    """In some battle of four maps; what it does has tests above, or none if it only moves the statistics."""
     default = getattr(Settings(), name)
     other = CHANGED.get(name, not default)
     assert other != default
     differs = False
-    for map_name in ("3s5z", "3s_vs_5z"):
+    for map_name in ("3s5z", "3s_vs_5z", "MMM", "2c_vs_64zg"):
         outcomes = [
-            play_policy(make_battle(map_name, **{name: value})[0], policy, episodes=40)
+            play_policy(make_battle(map_name, **{name: value})[0], policy, episodes=20)
             for value in (default, other)
             for policy in (RANDOM, CLOSEST_ENEMY)
         ]

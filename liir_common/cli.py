@@ -454,6 +454,31 @@ def bench_train_command(
     _print_result(bench_train(map_name, env_steps, settings or ()), as_json)
 
 
+@app.command()
+def maps(as_json: Json = False) -> None:
+    """List the battle maps: who fights whom, the limit in steps, and what no source settles."""
+    from liir_common.battle.scenarios import SCENARIOS, describe
+
+    rows = [describe(scenario) for scenario in SCENARIOS.values()]
+    if as_json:
+        print(json.dumps(rows))
+        return
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table("map", "agents", "enemies", "actions", "limit", "terrain", "uncertain")
+    for row in rows:
+        sides = [_roll(row["agents"]), _roll(row["enemies"])]
+        table.add_row(
+            row["map"], *sides, str(row["n_actions"]), str(row["limit"]), row["terrain"], row["uncertain"]
+        )
+    Console().print(table)
+
+
+def _roll(units: dict[str, int]) -> str:
+    return ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in units.items())
+
+
 def _print_result(result: dict[str, Any], as_json: bool) -> None:
     if as_json:
         print(json.dumps(result))

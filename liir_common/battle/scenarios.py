@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from liir_common.battle.parameters import resolve
-from liir_common.battle.tables import Battle, Tables, build_battle, build_tables
+from liir_common.battle.tables import FIRST_ATTACK, Battle, Tables, build_battle, build_tables
+from liir_common.battle.terrain import TERRAINS
 
 
 @dataclass(frozen=True)
@@ -42,16 +44,6 @@ class Scenario:
     enemy_type_order: tuple[str, ...] = ()
     uncertain: str = ""
     """What no source settles about this map in particular, beside the parameters of all maps"""
-
-    @property
-    def n_allies(self) -> int:
-        """Agents."""
-        return sum(spawn.count for spawn in self.allies)
-
-    @property
-    def n_enemies(self) -> int:
-        """Enemies; all SMAC v1 maps begin with everybody on the field."""
-        return sum(spawn.count for spawn in self.enemies)
 
 
 _WEST, _EAST = (9.0, 16.0), (23.0, 16.0)
@@ -211,6 +203,28 @@ def find_scenario(map_name: str) -> Scenario:
     if map_name not in SCENARIOS:
         raise ValueError(f"unknown map {map_name!r}; known: {', '.join(SCENARIOS)}")
     return SCENARIOS[map_name]
+
+
+def describe(scenario: Scenario) -> dict[str, Any]:
+    """A map as plain values: who fights whom, how long, where, and what is uncertain about it."""
+    terrain = TERRAINS[scenario.terrain]
+    enemies = _counts(scenario.enemies)
+    return {
+        "map": scenario.name,
+        "agents": _counts(scenario.allies),
+        "enemies": enemies,
+        "n_actions": FIRST_ATTACK + sum(enemies.values()),
+        "limit": scenario.limit,
+        "terrain": scenario.terrain,
+        "uncertain": "; ".join(filter(None, (terrain.uncertain, scenario.uncertain))),
+    }
+
+
+def _counts(spawns: Sequence[Spawn]) -> dict[str, int]:
+    counts: Counter[str] = Counter()
+    for spawn in spawns:
+        counts[spawn.unit_type] += spawn.count
+    return dict(counts)
 
 
 def make_battle(map_name: str, **options: Any) -> tuple[Tables, Battle]:

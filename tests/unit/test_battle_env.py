@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from pettingzoo.test import parallel_api_test, parallel_seed_test, render_test
 from pettingzoo.utils.conversions import parallel_to_aec
+from typer.testing import CliRunner
 
 from liir_common.battle.bench import bench_sim
 from liir_common.battle.calibrate import calibrate
@@ -17,6 +18,7 @@ from liir_common.battle.env import BattleEnv, battle_spec, parallel_env
 from liir_common.battle.render import LETTERS, Shot, draw_rgb
 from liir_common.battle.scenarios import SCENARIOS, make_battle
 from liir_common.battle.units import UNIT_TYPES
+from liir_common.cli import app
 
 
 @pytest.mark.filterwarnings("error")
@@ -242,3 +244,20 @@ def test_bench_and_calibration_measure() -> None:
     assert rows["step aside", "dead allies"].measured == 0
     with pytest.raises(ValueError, match="nothing is published"):
         calibrate("25m")
+
+
+def test_maps_are_listed() -> None:
+    listed = CliRunner().invoke(app, ["maps", "--json"])
+    assert listed.exit_code == 0
+    rows = {row["map"]: row for row in json.loads(listed.stdout)}
+    assert len(rows) == 23
+    for name, row in rows.items():
+        spec = battle_spec(name)
+        assert sum(row["agents"].values()) == spec.n_agents
+        assert row["n_actions"] == spec.n_actions == 6 + sum(row["enemies"].values())
+        assert row["limit"] == spec.episode_limit
+        assert row["uncertain"]
+    assert rows["MMM2"]["enemies"] == {"marine": 8, "marauder": 3, "medivac": 1}
+    assert rows["2c_vs_64zg"]["agents"] == {"colossus": 2}
+    table = CliRunner().invoke(app, ["maps"], env={"COLUMNS": "200"}).stdout
+    assert all(name in table for name in rows)

@@ -253,8 +253,6 @@ def _act(tables, battle, i, now, upwards):
         unit.shield = min(spec.shield, unit.shield + _SHIELD_PER_LOOP)
     if spec.regeneration > 0.0:
         unit.health = min(spec.health, unit.health + spec.regeneration)
-    if tables.rules[0].has_healers and spec.heals:
-        return _treat(tables, battle, i, now)
     if unit.hits > 0:
         if now >= unit.hit_at:
             _release(tables, battle, i, now)
@@ -262,6 +260,8 @@ def _act(tables, battle, i, now, upwards):
     # Most of the time in a fight: neither walking nor firing is possible yet.
     if now < unit.free_at and now < unit.ready_at:
         return False
+    if tables.rules[0].has_healers and spec.heals:
+        return _treat(tables, battle, i, now)
     if unit.order == ATTACK_MOVE:
         _acquire(tables, battle, i, now, upwards)
     if unit.target >= 0:

@@ -86,8 +86,10 @@ def _write_enemies(tables, battle, i, obs, mask, at):
         distance2 = _write_place(battle, i, rules.n_allies + j, obs, at)
         if distance2 < SIGHT2:
             # SMAC v1 looks a healer's slots up as if they were attacks.
-            obs[at] = mask[FIRST_ATTACK + j] if heals else distance2 <= SHOOT_RANGE2
-            mask[FIRST_ATTACK + j] = obs[at] > 0.0
+            if heals:
+                obs[at] = mask[FIRST_ATTACK + j]
+            else:
+                mask[FIRST_ATTACK + j] = obs[at] = distance2 <= SHOOT_RANGE2
             if rules.obs_all_health:
                 _write_health(other, spec, rules.enemy_shields, obs, at + 4)
             if rules.enemy_bits:

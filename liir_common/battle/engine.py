@@ -614,10 +614,10 @@ def _around(tables, battle, i, x, y):
 @inlined
 def _displace(tables, battle, i, x, y):
     """Move a unit, axis by axis, as far as the ground allows; so units slide along walls."""
-    layer = tables.specs[i].layer
-    if tables.layers[layer, int(battle.x[i] + x), int(battle.y[i])]:
+    cells = tables.layers[np.uint64(tables.specs[i].layer)]
+    if cells[int(battle.x[i] + x), int(battle.y[i])]:
         battle.x[i] += x
-    if tables.layers[layer, int(battle.x[i]), int(battle.y[i] + y)]:
+    if cells[int(battle.x[i]), int(battle.y[i] + y)]:
         battle.y[i] += y
 
 

@@ -8,13 +8,13 @@ from fractions import Fraction
 
 import numpy as np
 
-from liir_common.battle.engine import LOOPS_PER_STEP
 from liir_common.battle.env import BattleEnv, UnitRecord
 from liir_common.battle.render import Image, draw_rgb
 from liir_common.errors import ConfigError
 from liir_common.replay.record import Frame, Recording
 
 _STEPS_PER_SECOND: float = BattleEnv.metadata["render_fps"]
+_PICTURES_PER_STEP = 8
 _SCALE = 24
 """Pixels per cell; even, since H.264 wants even sizes"""
 _SHOT = 0.5
@@ -24,7 +24,7 @@ _LAST_SECONDS = 1.5
 
 
 def write_gif(recording: Recording) -> bytes:
-    """An endless GIF with a frame for every second game loop.
+    """An endless GIF with four frames a step.
 
     Raises:
         ConfigError: Pillow is not installed.
@@ -33,7 +33,7 @@ def write_gif(recording: Recording) -> bytes:
         from PIL import Image as pillow
     except ImportError:
         raise ConfigError('a GIF wants Pillow: pip install "liir-service[animation]"') from None
-    per_step = LOOPS_PER_STEP // 2
+    per_step = _PICTURES_PER_STEP // 2
     frames = [pillow.fromarray(image) for image in draw_frames(recording, per_step)]
     milliseconds = [10 * round(100 / (_STEPS_PER_SECOND * per_step))] * len(frames)  # a GIF counts in 10 ms
     milliseconds[-1] = round(1000 * _LAST_SECONDS)
@@ -43,7 +43,7 @@ def write_gif(recording: Recording) -> bytes:
 
 
 def write_mp4(recording: Recording) -> bytes:
-    """An H.264 video with a frame for every game loop.
+    """An H.264 video with eight frames a step.
 
     Raises:
         ConfigError: PyAV is not installed.
@@ -52,8 +52,8 @@ def write_mp4(recording: Recording) -> bytes:
         import av
     except ImportError:
         raise ConfigError('an MP4 wants PyAV: pip install "liir-service[animation]"') from None
-    rate = Fraction(_STEPS_PER_SECOND * LOOPS_PER_STEP).limit_denominator(10)
-    images = list(draw_frames(recording, LOOPS_PER_STEP))
+    rate = Fraction(_STEPS_PER_SECOND * _PICTURES_PER_STEP).limit_denominator(10)
+    images = list(draw_frames(recording, _PICTURES_PER_STEP))
     images += images[-1:] * round(_LAST_SECONDS * rate)
     file = io.BytesIO()
     with av.open(file, "w", format="mp4") as container:

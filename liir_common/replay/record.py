@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liir_common import checkpoint
-from liir_common.battle.engine import LOOPS_PER_STEP
 from liir_common.battle.env import BattleEnv, UnitRecord
+from liir_common.battle.parameters import resolve
 from liir_common.battle.render import Shot
 from liir_common.battle.scenarios import make_battle
 from liir_common.battle.tables import FIRST_ATTACK
@@ -94,7 +94,7 @@ def record(
         manifest=manifest,
         pathing=make_battle(map_name, **options)[0].pathing,
         frames=battle.frames,
-        shots=list(map(find_shots, battle.frames[:-1], battle.frames[1:], trajectory.actions)),
+        shots=_all_shots(battle.frames, trajectory.actions, resolve(options).step_mul),
         trajectory=trajectory,
         probabilities=policy_probabilities(weights, spec, trajectory),
         intrinsic=_intrinsic(manifest, tensors, trajectory),
@@ -140,8 +140,13 @@ def _intrinsic(manifest: Manifest, tensors: Weights, trajectory: Trajectory) -> 
     return IntrinsicReward.from_checkpoint(manifest, tensors)(trajectory.obs[:-1])
 
 
-def find_shots(before: Frame, after: Frame, actions: IntArray) -> list[Shot]:
-    """Attacks that began in the step between two frames in which `actions` [n] were ordered.
+def _all_shots(frames: Sequence[Frame], actions: IntArray, loops: int) -> list[list[Shot]]:
+    steps = zip(frames[:-1], frames[1:], actions, strict=True)
+    return [find_shots(before, after, ordered, loops) for before, after, ordered in steps]
+
+
+def find_shots(before: Frame, after: Frame, actions: IntArray, loops: int) -> list[Shot]:
+    """Attacks that began in the step of `loops` between two frames in which `actions` [n] were ordered.
 
     An attack sets the weapon's cooldown, which otherwise only falls; its target is the one ordered, else
     the one that the unit has or had.
@@ -150,7 +155,7 @@ def find_shots(before: Frame, after: Frame, actions: IntArray) -> list[Shot]:
     ordered = [n + int(action) - FIRST_ATTACK if action >= FIRST_ATTACK else None for action in actions]
     shots = []
     for i, (old, new) in enumerate(zip(before, after, strict=True)):
-        if new["cooldown"] > max(0.0, old["cooldown"] - LOOPS_PER_STEP):
+        if new["cooldown"] > max(0.0, old["cooldown"] - loops):
             targets = (ordered[i] if i < n else None, target_number(new, n), target_number(old, n))
             target = next((target for target in targets if target is not None), None)
             if target is not None:

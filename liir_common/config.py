@@ -9,7 +9,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -21,6 +21,7 @@ from pydantic_settings import (
 )
 
 from liir_common.errors import ConfigError
+from liir_common.types import Exploration
 
 
 class Section(BaseModel):
@@ -42,14 +43,14 @@ class EnvConfig(Section):
 
 
 class ExplorationConfig(Section):
-    """Floor of the behaviour policy, lowered linearly over environment steps."""
+    """ε of the behaviour policy, lowered linearly over environment steps."""
 
     start: float = Field(0.5, ge=0, le=1)
     end: float = Field(0.01, ge=0, le=1)
     steps: int = Field(50_000, ge=0)
 
     def epsilon(self, env_steps: int) -> float:
-        """The floor after `env_steps` steps of the run."""
+        """ε after `env_steps` steps of the run."""
         done = min(1.0, env_steps / self.steps) if self.steps else 1.0
         return self.start + (self.end - self.start) * done
 
@@ -66,10 +67,33 @@ class OptimizerConfig(Section):
     """Largest norm of the gradient."""
 
 
-class AlgorithmConfig(Section):
-    """The learning rule; one model for the whole LIIR family, so that comparisons share settings."""
+class ReplayConfig(Section):
+    """What value-based methods learn from."""
 
-    name: Literal["liir", "central_v"] = "liir"
+    episodes: int = Field(5000, ge=1)
+    """The newest so many are kept."""
+    batch_episodes: int = Field(32, ge=1)
+    """Drawn at random for one update; there is none before so many are kept."""
+    episodes_per_update: int = Field(8, ge=1)
+    """Episodes collected for one update."""
+
+    @model_validator(mode="after")
+    def _holds_a_batch(self) -> Self:
+        if self.batch_episodes > self.episodes:
+            raise ValueError(
+                f"batch_episodes wants to be at most episodes ({self.episodes}), got {self.batch_episodes}"
+            )
+        return self
+
+
+class AlgorithmConfig(Section):
+    """The learning rule; one model for all methods, so that comparisons share settings.
+
+    A method reads what it has a use for. In the value-based ones, iql, vdn and qmix, the Q network counts
+    as the policy and has the policy's optimiser.
+    """
+
+    name: Literal["liir", "central_v", "iac", "coma", "iql", "vdn", "qmix"] = "liir"
     lambda_: float = Field(0.01, ge=0, alias="lambda")
     """λ of Eq. (2): weight of the intrinsic reward; 0 is the control without it."""
     freeze_eta: bool = False
@@ -80,13 +104,13 @@ class AlgorithmConfig(Section):
     """r_in is squashed to ± this value."""
     gamma: float = Field(0.99, ge=0, le=1)
     gae_lambda: float = Field(0.95, ge=0, le=1)
-    """λ_g of the advantages; 0 is TD(0) as the paper prints it."""
+    """λ_g of the returns that values and advantages are made from; 0 is TD(0) as the paper prints it."""
     limit_is_terminal: bool = True
     """Treat the step limit as an end; otherwise bootstrap there."""
     normalize_advantages: bool = True
     normalize_values: bool = True
     target_interval: int = Field(0, ge=0)
-    """Learner steps between copies to the target critics; 0 means no target networks."""
+    """Learner steps between copies to the target networks; 0 means no target networks."""
     policy_epochs: int = Field(4, ge=1)
     """K policy steps per batch; the meta-gradient goes through the last."""
     critic_epochs: int = Field(4, ge=1)
@@ -105,6 +129,26 @@ class AlgorithmConfig(Section):
     exploration: ExplorationConfig = ExplorationConfig()
     meta_gradient: Literal["jvp", "difference"] = "jvp"
     """How c = <ũ, ∇log π> is computed: exact forward mode, or by central difference."""
+    replay: ReplayConfig = ReplayConfig()
+    mixer_width: int = Field(32, ge=1)
+    """Hidden units of QMIX's mixer."""
+    hypernet_width: int = Field(64, ge=1)
+    """Hidden units of the networks that make the mixer's weights."""
+
+    @property
+    def behaviour(self) -> Exploration:
+        """How actors choose actions."""
+        value_based = self.name in ("iql", "vdn", "qmix")
+        return Exploration.EPSILON_GREEDY if value_based else Exploration.SOFTMAX_FLOOR
+
+    @model_validator(mode="after")
+    def _coma_sees_actions(self) -> Self:
+        if self.name == "coma" and not self.limit_is_terminal:
+            raise ValueError(
+                "coma wants limit_is_terminal: its critic would value a joint action after the limit, "
+                "which nobody takes"
+            )
+        return self
 
 
 class TrainingConfig(Section):
@@ -176,10 +220,12 @@ class Config(BaseSettings):
     @model_validator(mode="before")
     @classmethod
     def _fill_preset(cls, data: dict[str, Any]) -> dict[str, Any]:
-        if isinstance(data.get("algorithm"), str):
-            data = data | {"algorithm": {"name": data["algorithm"]}}
+        data = _spelled_out(data)
         preset = str(data.get("preset", "strong"))
-        return merge(PRESETS.get(preset, {}), data)
+        algorithm = data.get("algorithm")
+        name = algorithm.get("name") if isinstance(algorithm, Mapping) else None
+        of_method = METHOD_PRESETS.get(str(name), {}) if preset != "none" else {}
+        return merge(merge(PRESETS.get(preset, {}), {"algorithm": of_method}), data)
 
     @classmethod
     def settings_customise_sources(
@@ -224,6 +270,34 @@ PRESETS: Mapping[str, dict[str, Any]] = {
             "critic_optimizer": _RMSPROP,
         },
     },
+}
+_PYMARL = {
+    "normalize_advantages": False,
+    "normalize_values": False,
+    "policy_epochs": 1,
+    "entropy": 0.0,
+    "orthogonal_init": False,
+    "policy_optimizer": _RMSPROP,
+    "critic_optimizer": _RMSPROP,
+}
+_PYMARL_Q = _PYMARL | {
+    "gae_lambda": 0.0,
+    "target_interval": 6,  # about 200 episodes
+    "exploration": {"start": 1.0, "end": 0.05, "steps": 50_000},
+}
+METHOD_PRESETS: Mapping[str, dict[str, Any]] = {
+    # Learning rules that the presets above do not speak of: PyMARL's, whatever the preset.
+    "coma": _PYMARL
+    | {
+        "gae_lambda": 0.8,
+        # PyMARL takes a critic step for every time step of a batch and copies after 200 of them.
+        "critic_epochs": 8,
+        "target_interval": 25,
+        "exploration": {"start": 0.5, "end": 0.01, "steps": 100_000},
+    },
+    "iql": _PYMARL_Q,
+    "vdn": _PYMARL_Q,
+    "qmix": _PYMARL_Q,
 }
 
 
@@ -274,7 +348,13 @@ def _read(path: Path) -> dict[str, Any]:
         return {}
     if not isinstance(tree, dict):
         raise ConfigError(f"{path}: wanted a mapping of settings, got {type(tree).__name__}")
-    return tree
+    return _spelled_out(tree)
+
+
+def _spelled_out(tree: dict[str, Any]) -> dict[str, Any]:
+    """`algorithm: qmix` is short for `algorithm: {name: qmix}`."""
+    name = tree.get("algorithm")
+    return tree | {"algorithm": {"name": name}} if isinstance(name, str) else tree
 
 
 def parse_settings(settings: Sequence[str]) -> dict[str, Any]:
@@ -294,7 +374,7 @@ def parse_settings(settings: Sequence[str]) -> dict[str, Any]:
             raise ConfigError(f"--set {key}: the value {text!r} is not YAML: {error}") from None
         for part in reversed(key.split(".")):
             value = {part: value}
-        tree = merge(tree, value)
+        tree = merge(tree, _spelled_out(value))
     return tree
 
 

@@ -20,20 +20,23 @@ from liir_common.types import Exploration, Ticket, Weights
 log = structlog.get_logger()
 
 _AWAY = (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.DEADLINE_EXCEEDED)
-_MODES = {"greedy": Exploration.GREEDY, "sampled": Exploration.SOFTMAX_FLOOR}
 
 
 def evaluate(
-    player: Player, weights: Weights, run_seed: int, episode: int, episodes: int, mode: str
+    player: Player, weights: Weights, config: Config, episode: int, mode: str
 ) -> checkpoint_pb2.EpisodeStats:
     """Play the test episodes of one checkpoint with seeds that no training episode has.
 
-    `mode` is "greedy" (the best action every time) or "sampled" (drawn from the policy).
+    `mode` is "greedy" (the best action every time) or "sampled" (drawn from the policy; where values and
+    not probabilities are learned, ε-greedy with the ε at which training ends).
     """
     player.load(weights)
-    base = seeds.episode_seed(run_seed, seeds.EVALUATION, episode)
+    base = seeds.episode_seed(config.seed, seeds.EVALUATION, episode)
+    exploration = Exploration.GREEDY if mode == "greedy" else config.algorithm.behaviour
+    epsilon = config.algorithm.exploration.end if exploration == Exploration.EPSILON_GREEDY else 0.0
+    episodes = config.evaluation.episodes
     played = [
-        player.play(Ticket(index, 0, seeds.derive(base, index), _MODES[mode], 0.0))
+        player.play(Ticket(index, 0, seeds.derive(base, index), exploration, epsilon))
         for index in range(episodes)
     ]
     metrics.EVALUATION_EPISODES.labels(mode).inc(episodes)
@@ -87,15 +90,8 @@ class Evaluator:
         _, tensors = client.get(frozen.episode)
         weights = checkpoint.section(tensors, "policy")
         stats = {
-            mode: evaluate(
-                self._player,
-                weights,
-                self._config.seed,
-                frozen.episode,
-                self._config.evaluation.episodes,
-                mode,
-            )
-            for mode in _MODES
+            mode: evaluate(self._player, weights, self._config, frozen.episode, mode)
+            for mode in ("greedy", "sampled")
         }
         log.info(
             "tested", episode=frozen.episode, wins=stats["greedy"].wins, sampled_wins=stats["sampled"].wins

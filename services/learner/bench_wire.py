@@ -41,7 +41,7 @@ def bench_wire(map_name: str, streams: int = 4, batches: int = 40, repeats: int 
 async def _measure(settings: config.Config, streams: int, batches: int, repeats: int) -> dict[str, Any]:
     spec = env_spec(settings.env)
     delivered: queue.SimpleQueue[list[Trajectory] | None] = queue.SimpleQueue()
-    service = RolloutService(settings, spec, Exploration.SOFTMAX_FLOOR, 0, delivered)
+    service = RolloutService(settings, spec, 0, delivered)
     server = Server("127.0.0.1", 0, insecure=False)
     rollout_pb2_grpc.add_RolloutServiceServicer_to_server(service, server.grpc)
     await server.start()

@@ -16,7 +16,7 @@ from liir_common.config import Config
 from liir_common.rpc import codec
 from liir_common.rpc.gen.liir.v1 import rollout_pb2, rollout_pb2_grpc
 from liir_common.rpc.server import Refused
-from liir_common.types import EnvSpec, Exploration, Weights
+from liir_common.types import EnvSpec, Weights
 from services.learner.intake import Intake, Opening
 from services.learner.trainer import Batches
 
@@ -42,14 +42,12 @@ class ActorStream:
 class RolloutService(rollout_pb2_grpc.RolloutServiceServicer):
     """Lives on the event loop; only `publish` may be called from elsewhere, through the loop."""
 
-    def __init__(
-        self, config: Config, spec: EnvSpec, exploration: Exploration, first_batch: int, batches: Batches
-    ) -> None:
+    def __init__(self, config: Config, spec: EnvSpec, first_batch: int, batches: Batches) -> None:
         """Deliver complete batches, from `first_batch` on, to `batches`."""
         self._config = config
         self._spec = spec
         self._intake = Intake(
-            config.seed, exploration, config.training.batch_episodes, first_batch, batches.put
+            config.seed, config.algorithm.behaviour, config.training.batch_episodes, first_batch, batches.put
         )
         self._policies: dict[int, rollout_pb2.PlayResponse] = {}
         self._streams: set[ActorStream] = set()

@@ -3,7 +3,7 @@
 config.yaml      the resolved configuration
 run.json         run id, build, environment
 endpoints.json   where the learner listens while it runs
-state/           the learner's own state at the last saves
+state/           the learner's own state at the last saves, and the replay if the method has one
 checkpoints/     frozen checkpoints
 metrics.csv      one row per learner step
 evaluations.csv  one row per tested checkpoint
@@ -32,6 +32,7 @@ from liir_common.config import Config
 from liir_common.errors import ConfigError, CorruptError
 from liir_common.files import Table, write_atomic
 from liir_common.types import EnvSpec
+from services.learner.replay_store import ReplayStore
 
 log = structlog.get_logger()
 
@@ -77,6 +78,7 @@ class RunDirectory:
         )
         write_atomic(path / "config.yaml", yaml.safe_dump(config.tree(), sort_keys=False).encode())
         self.checkpoints = CheckpointStore(str(path / "checkpoints"))
+        self.replay = ReplayStore(path / "state")
         self.metrics = Table(path / "metrics.csv")
         self.evaluations = Table(path / "evaluations.csv")
 
@@ -91,6 +93,12 @@ class RunDirectory:
         write_atomic(self._state_path(counters.learner_step), save(contiguous, metadata))
         for old in self._state_paths()[:-_STATES_KEPT]:
             old.unlink()
+
+    @property
+    def oldest_state_step(self) -> int:
+        """Learner step of the oldest state that is kept; 0 if there is none."""
+        paths = self._state_paths()
+        return int(paths[0].stem.removeprefix("state-")) if paths else 0
 
     def load_state(self) -> tuple[Counters, dict[str, Tensor], dict[str, Any]] | None:
         """The newest state that can be read, or nothing if the run never saved one.

@@ -54,7 +54,7 @@ async def serve(config: Config, run: RunDirectory, spec: EnvSpec) -> None:
         asyncio.run_coroutine_threadsafe(checkpoints.changed(), loop)
 
     trainer = Trainer(run, algorithm, publish, frozen)
-    rollouts = RolloutService(config, spec, algorithm.exploration, trainer.next_batch, trainer.batches)
+    rollouts = RolloutService(config, spec, trainer.next_batch, trainer.batches)
     checkpoints = CheckpointService(run)
     stopping = asyncio.Event()
 

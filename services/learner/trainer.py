@@ -194,6 +194,7 @@ class Trainer:
 
     def _save(self) -> None:
         """Keep everything the next learner step depends on."""
+        self._save_replay()
         tensors = {f"algorithm.{name}": tensor for name, tensor in self.algorithm.state().items()}
         for opening, weights in self._openings:
             for name, array in weights.items():
@@ -201,15 +202,31 @@ class Trainer:
         notes = {"openings": [asdict(opening) for opening, _ in self._openings]}
         self.run_directory.save_state(self.progress.counters, tensors, notes)
 
+    def _save_replay(self) -> None:
+        """Append the new episodes, before the state that counts them; drop those that no kept state needs."""
+        replay, store = self.algorithm.replay, self.run_directory.replay
+        if replay is None:
+            return
+        first = max(store.stop, replay.first)
+        store.append(first, replay.frames(first))
+        oldest = self.run_directory.oldest_state_step * self.config.training.batch_episodes
+        store.prune(oldest - self.config.algorithm.replay.episodes)
+
+    def _restore_replay(self, total: int) -> None:
+        if self.algorithm.replay is not None:
+            first = max(0, total - self.config.algorithm.replay.episodes)
+            self.algorithm.replay.restore(total, self.run_directory.replay.load(first, total))
+
     def _restore(self) -> None:
         saved = self.run_directory.load_state()
+        counters = Counters() if saved is None else saved[0]
+        self._restore_replay(counters.episodes)
         if saved is None:
-            counters = Counters()
             for batch in range(self.config.training.lag + 1):
                 epsilon = self.config.algorithm.exploration.epsilon(0)
                 self._openings.append((Opening(batch, 0, epsilon), self.algorithm.policy()))
         else:
-            counters, tensors, notes = saved
+            _, tensors, notes = saved
             self.algorithm.load_state(_section(tensors, "algorithm."))
             for fields in notes["openings"]:
                 weights = _section(tensors, f"opening.{fields['batch']}.")

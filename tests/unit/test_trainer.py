@@ -16,6 +16,11 @@ from services.learner.trainer import Trainer
 from tests.samples import SPEC, make_trajectory
 
 BATCH = 4
+REPLAY = [
+    "algorithm.replay.episodes=10",
+    "algorithm.replay.batch_episodes=5",
+    "algorithm.replay.episodes_per_update=3",
+]
 STEPS = 6
 """Environment steps of each sample episode."""
 
@@ -74,15 +79,25 @@ def test_batches_are_played_by_the_version_that_the_lag_says(tmp_path: Path, lag
 
 
 @pytest.mark.parametrize("lag", [0, 1])
-@pytest.mark.parametrize("algorithm", ["liir", "central_v"])
-@pytest.mark.parametrize("outer", ["reuse", "fresh"])
-def test_training_in_two_parts_is_training_in_one(
-    tmp_path: Path, lag: int, algorithm: str, outer: str
-) -> None:
+@pytest.mark.parametrize(
+    "method",
+    [
+        ["liir"],
+        ["liir", "algorithm.outer_samples=fresh"],
+        ["central_v"],
+        ["iac"],
+        ["coma"],
+        ["iql", *REPLAY],
+        ["vdn", *REPLAY],
+        ["qmix", *REPLAY],
+    ],
+    ids=" ".join,
+)
+def test_training_in_two_parts_is_training_in_one(tmp_path: Path, lag: int, method: list[str]) -> None:
     settings = (
         f"training.lag={lag}",
-        f"algorithm.name={algorithm}",
-        f"algorithm.outer_samples={outer}",
+        f"algorithm={method[0]}",
+        *method[1:],
         "training.checkpoint_interval=4",
     )
     whole = Played(tmp_path / "whole", 6, *settings).train()
@@ -93,8 +108,11 @@ def test_training_in_two_parts_is_training_in_one(
     assert steps == ["1", "2", "3", "4", "5", "6"]
 
 
-def test_a_crash_costs_the_steps_since_the_last_save_and_changes_nothing(tmp_path: Path) -> None:
-    settings = ("training.checkpoint_interval=4", "training.save_interval=2")
+@pytest.mark.parametrize("method", [["algorithm=liir"], ["algorithm=qmix", *REPLAY]], ids=" ".join)
+def test_a_crash_costs_the_steps_since_the_last_save_and_changes_nothing(
+    tmp_path: Path, method: list[str]
+) -> None:
+    settings = ("training.checkpoint_interval=4", "training.save_interval=2", *method)
     whole = Played(tmp_path / "whole", 6, *settings).train()
     crashed = Played(tmp_path / "crashed", 6, *settings)
     for opening, weights in list(crashed.trainer._openings):

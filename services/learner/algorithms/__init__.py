@@ -10,16 +10,22 @@ import torch
 from numpy.typing import NDArray
 
 from liir_common.config import AlgorithmConfig
-from liir_common.types import Batch, EnvSpec, Exploration
+from liir_common.types import Batch, EnvSpec
 from services.learner.algorithms.central_v import CentralV
+from services.learner.algorithms.coma import Coma
+from services.learner.algorithms.iac import Iac
+from services.learner.algorithms.iql import Iql
 from services.learner.algorithms.liir import Liir
+from services.learner.algorithms.qmix import Qmix
+from services.learner.algorithms.replay import Replay
+from services.learner.algorithms.vdn import Vdn
 
 
 class Algorithm(Protocol):
     """What the learner needs of a learning rule. Not thread-safe: one thread calls it."""
 
-    exploration: Exploration
-    """How actors choose actions"""
+    replay: Replay | None
+    """Episodes to learn from again, saved beside the state; None if the method is on-policy"""
 
     def policy(self) -> dict[str, NDArray[np.float32]]:
         """Copies of the policy's weights under the names and shapes of `policy_shapes`."""
@@ -36,7 +42,7 @@ class Algorithm(Protocol):
         """
 
     def state(self) -> dict[str, torch.Tensor]:
-        """Copies, on the CPU, of everything that `update` depends on."""
+        """Copies, on the CPU, of everything that `update` depends on but the replay."""
 
     def load_state(self, state: Mapping[str, torch.Tensor]) -> None:
         """Go on from `state`, bit for bit as if never stopped.
@@ -46,12 +52,18 @@ class Algorithm(Protocol):
         """
 
     def parameter_counts(self) -> dict[str, int]:
-        """Number of parameters of theta, eta, phi and varphi, and the budget of the last three."""
+        """Number of parameters of each network, theta first; budget, if there is one, is what the paper
+        grants those beside theta."""
 
 
 _METHODS: Mapping[str, Callable[[EnvSpec, AlgorithmConfig, int, torch.device, torch.dtype], Algorithm]] = {
     "liir": Liir,
     "central_v": CentralV,
+    "iac": Iac,
+    "coma": Coma,
+    "iql": Iql,
+    "vdn": Vdn,
+    "qmix": Qmix,
 }
 
 

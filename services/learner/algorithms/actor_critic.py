@@ -1,4 +1,4 @@
-"""What all methods share that train one stochastic policy and the team's value V_ϕ(s) on each batch."""
+"""What all methods share that train one stochastic policy and an extrinsic value on each batch."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ from torch import Tensor
 
 from liir_common import seeds
 from liir_common.config import AlgorithmConfig
-from liir_common.types import Batch, EnvSpec, Exploration
+from liir_common.types import Batch, EnvSpec
 from services.learner.algorithms.critic import Critic
 from services.learner.algorithms.data import Data, prepare
-from services.learner.algorithms.networks import StateValue
+from services.learner.algorithms.networks import Mlp, coma_critic_size
 from services.learner.algorithms.policy import Policy
+from services.learner.algorithms.replay import Replay
 from services.learner.algorithms.returns import lambda_return, normalize
 from services.learner.algorithms.state import prefixed, restore, snapshot
 
@@ -24,9 +25,10 @@ THETA, VARPHI, PHI, ETA = range(4)
 
 
 class ActorCritic:
-    """The policy θ, the extrinsic value ϕ and their estimates; methods add their update."""
+    """The policy θ, the extrinsic value ϕ, whose network is the method's choice, and their estimates; methods
+    add their update."""
 
-    exploration = Exploration.SOFTMAX_FLOOR
+    replay: Replay | None = None
 
     def __init__(
         self,
@@ -35,13 +37,12 @@ class ActorCritic:
         seed: int,
         device: torch.device,
         dtype: torch.dtype,
-        value_width: int,
+        value: Mlp,
     ) -> None:
         self._spec, self._config = spec, config
         self._device, self._dtype = device, dtype
         self._policy = Policy(spec, config, seeds.derive(seed, THETA), device, dtype)
-        network = StateValue(spec, value_width)
-        self._varphi = Critic(network, config, seeds.derive(seed, VARPHI), device, dtype)
+        self._varphi = Critic(value, config, seeds.derive(seed, VARPHI), device, dtype)
 
     def policy(self) -> dict[str, NDArray[np.float32]]:
         """float32 copies of θ under the names and shapes of `policy_shapes`."""
@@ -50,6 +51,11 @@ class ActorCritic:
     def intrinsic(self) -> dict[str, NDArray[np.float32]]:
         """float32 copies of the weights of r_in; none unless the method has it."""
         return {}
+
+    def parameter_counts(self) -> dict[str, int]:
+        """Parameters of each network and the budget of all but θ."""
+        budget = coma_critic_size(self._spec)
+        return {"theta": self._policy.theta.numel(), "varphi": self._varphi.size, "budget": budget}
 
     def state(self) -> dict[str, Tensor]:
         """Copies of everything that `update` depends on, on the CPU."""

@@ -18,27 +18,17 @@ class CentralV(ActorCritic):
         self, spec: EnvSpec, config: AlgorithmConfig, seed: int, device: torch.device, dtype: torch.dtype
     ) -> None:
         width = fit_width(coma_critic_size(spec), lambda width: count(StateValue(spec, width).shapes))
-        super().__init__(spec, config, seed, device, dtype, width)
+        super().__init__(spec, config, seed, device, dtype, StateValue(spec, width))
 
     def update(self, batch: Batch) -> dict[str, float]:
         """One learner step on `batch`; returns its figures.
 
         Raises:
-            ValueError: the batch does not fit (see `prepare`); nothing has changed then.
+            ValueError: the batch does not fit (see `check`); nothing has changed then.
             FloatingPointError: learning has diverged.
         """
         data = self._prepare(batch)
-        value, target = self._varphi.values(data)
+        value, target = self._varphi.values(data, data.state)
         returns = self._return(data, data.reward, target)
         _, _, metrics = self._policy.advance(data, self._advantage(data, returns, value))
-        return to_floats(metrics | self._varphi.fit(data, returns, "value"))
-
-    def parameter_counts(self) -> dict[str, int]:
-        """Parameters of each network and the budget of all but θ."""
-        return {
-            "theta": self._policy.theta.numel(),
-            "eta": 0,
-            "phi": 0,
-            "varphi": self._varphi.size,
-            "budget": coma_critic_size(self._spec),
-        }
+        return to_floats(metrics | self._varphi.fit(data, data.state, returns, "value"))

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
 from liir_common.config import AlgorithmConfig
 from services.learner.algorithms.data import Data
-from services.learner.algorithms.networks import AgentValue, StateValue, initial
+from services.learner.algorithms.networks import Mlp, initial
 from services.learner.algorithms.optim import Optimizer
 from services.learner.algorithms.returns import explained_variance
 from services.learner.algorithms.state import prefixed
@@ -41,18 +43,14 @@ class Normalizer:
 
 
 class Critic:
-    """V_φ or V_ϕ with its optimiser; values start at zero.
+    """A value function with its optimiser; values start at zero.
 
-    `network` maps states [M, S] to values [M, k], k = 1 for the team and k = n for one value per agent.
+    `network` maps its inputs of the M team rows, [M, ...], to [M, k]: k = 1 value for the team or k = n
+    values, one per agent. COMA's has one per action as well.
     """
 
     def __init__(
-        self,
-        network: AgentValue | StateValue,
-        config: AlgorithmConfig,
-        seed: int,
-        device: torch.device,
-        dtype: torch.dtype,
+        self, network: Mlp, config: AlgorithmConfig, seed: int, device: torch.device, dtype: torch.dtype
     ) -> None:
         self._config = config
         self._network = network
@@ -74,30 +72,40 @@ class Critic:
         """Number of parameters that are trained."""
         return self._parameters.numel()
 
-    @torch.no_grad()
-    def values(self, data: Data) -> tuple[Tensor, Tensor]:
+    def values(self, data: Data, inputs: Tensor) -> tuple[Tensor, Tensor]:
         """V and the V̄ that returns are built from, both [B, T+1, k]: the live and the target network's."""
-        live = self._values(self._parameters, data)
-        return live, self._values(self._target, data) if self._config.target_interval else live
+        live, target = self.outputs(inputs)
+        return data.team(live), data.team(target)
 
-    def _values(self, parameters: Tensor, data: Data) -> Tensor:
+    @torch.no_grad()
+    def outputs(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """What the live and the target network make of `inputs`."""
+        live = self._outputs(self._parameters, inputs)
+        return live, self._outputs(self._target, inputs) if self._config.target_interval else live
+
+    def _outputs(self, parameters: Tensor, inputs: Tensor) -> Tensor:
         mean, std = self._normalizer.mean_and_std()
-        return data.team(mean + std * self._network(parameters, data.state))
+        return mean + std * self._network(parameters, inputs)
 
-    def fit(self, data: Data, returns: Tensor, name: str) -> dict[str, Tensor]:
-        """Regress on `returns` [B, T, k]: full-batch steps on the mean square over all played steps.
+    def fit(self, data: Data, inputs: Tensor, returns: Tensor, name: str) -> dict[str, Tensor]:
+        """Regress the values of the played steps on `returns` [B, T, k]; see `regress`."""
+        played = inputs[: data.played]
+        return self.regress(lambda outputs: outputs, played, returns[data.filled.bool()], name)
+
+    def regress(
+        self, pick: Callable[[Tensor], Tensor], inputs: Tensor, target: Tensor, name: str
+    ) -> dict[str, Tensor]:
+        """Full-batch steps on the mean square of what `pick` takes from the outputs, less `target`.
 
         The figures, named after `name`, are those before the first step.
         """
-        target = returns[data.filled.bool()]
-        state = data.state[: data.played]
         if self._config.normalize_values:
             self._normalizer.update(target)
         mean, std = self._normalizer.mean_and_std()
         target = (target - mean) / std
         for epoch in range(self._config.critic_epochs):
             parameters = self._parameters.detach().requires_grad_()
-            prediction = self._network(parameters, state)
+            prediction = pick(self._network(parameters, inputs))
             loss = (prediction - target).square().mean()
             if epoch == 0:
                 figures = {

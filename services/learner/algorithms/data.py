@@ -83,16 +83,14 @@ def prepare(
     bootstrapped from.
 
     Raises:
-        ValueError: shapes differ from `spec`, an episode is not a filled prefix with an end at its last
-            step, nobody is alive, or a living agent has no action or took one that was not available.
+        ValueError: as `check`.
     """
-    _check_episodes(batch, spec)
+    check(batch, spec)
     order, lengths = _lives(batch)
     t, rank = np.nonzero(np.arange(lengths[0])[:, None] < lengths)
     b, i = np.divmod(order[rank], spec.n_agents)
     alive = batch.alive[b, t, i]
     mask, actions = batch.mask[b, t, i], batch.actions[b, t, i]
-    _check_actions(mask[alive], actions[alive])
     # A gap in a life may have any mask; no row may leave the softmax without an action.
     mask = mask | ~alive[:, None]
 
@@ -132,14 +130,10 @@ def prepare(
 
 def _lives(batch: Batch) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """The agents (b·n + i) that live at all, longest life first, and the lengths of their lives."""
-    episodes, steps, n = batch.log_mu.shape
+    steps = batch.reward.shape[1]
     lives = (batch.alive[:, :-1] & batch.filled[..., None]).transpose(0, 2, 1).reshape(-1, steps)
     lengths = np.where(lives, np.arange(1, steps + 1), 0).max(1)
     order = np.argsort(-lengths, kind="stable")[: np.count_nonzero(lengths)]
-    if not len(order):
-        raise ValueError(
-            f"a batch wants a living agent; in {episodes} episodes of {n} agents nobody is alive"
-        )
     return order, lengths[order]
 
 
@@ -150,6 +144,31 @@ def _last_actions(
     before = np.eye(n_actions, dtype=np.float32)[batch.actions[b, t - 1, i]]
     before[t == 0] = 0
     return before
+
+
+def observations(batch: Batch, data: Data) -> Tensor:
+    """What every agent observes in the team rows of `data`, which come from `batch`: [M', n, O], zero for
+    the dead."""
+    steps = data.steps.cpu().numpy()
+    obs, alive = (array.reshape(-1, *array.shape[2:])[steps] for array in (batch.obs, batch.alive))
+    return torch.from_numpy(obs * alive[..., None]).to(data.state)
+
+
+def check(batch: Batch, spec: EnvSpec) -> None:
+    """See that one can learn from `batch`.
+
+    Raises:
+        ValueError: shapes differ from `spec`, an episode is not a filled prefix with an end at its last
+            step, nobody is alive, or a living agent has no action or took one that was not available.
+    """
+    _check_episodes(batch, spec)
+    alive = batch.alive[:, :-1] & batch.filled[..., None]
+    if not alive.any():
+        episodes, _, n = alive.shape
+        raise ValueError(
+            f"a batch wants a living agent; in {episodes} episodes of {n} agents nobody is alive"
+        )
+    _check_actions(batch.mask[:, :-1][alive], batch.actions[alive])
 
 
 def _check_episodes(batch: Batch, spec: EnvSpec) -> None:

@@ -73,8 +73,8 @@ class Liir(ActorCritic):
             return reward, AgentValue(spec, width), StateValue(spec, width)
 
         width = fit_width(coma_critic_size(spec), lambda w: sum(count(net.shapes) for net in networks(w)))
-        super().__init__(spec, config, seed, device, dtype, width)
-        self._reward, phi, _ = networks(width)
+        self._reward, phi, varphi = networks(width)
+        super().__init__(spec, config, seed, device, dtype, varphi)
         self._phi = Critic(phi, config, seeds.derive(seed, PHI), device, dtype)
         gain, orthogonal = config.r_in_gain, config.orthogonal_init
         self._eta = initial(self._reward, gain, orthogonal, seeds.derive(seed, ETA), device, dtype)
@@ -88,11 +88,11 @@ class Liir(ActorCritic):
         Step 5 of the algorithm judges θ' on the samples that made it or, one batch later, on fresh ones.
 
         Raises:
-            ValueError: the batch does not fit (see `prepare`); nothing has changed then.
+            ValueError: the batch does not fit (see `check`); nothing has changed then.
             FloatingPointError: learning has diverged.
         """
         data = self._prepare(batch)
-        value, target = self._varphi.values(data)
+        value, target = self._varphi.values(data, data.state)
         extrinsic_return = self._return(data, data.reward, target)
         a_ex = self._advantage(data, extrinsic_return, value)
         metrics: dict[str, Tensor] = {}
@@ -106,13 +106,13 @@ class Liir(ActorCritic):
         elif self._learns_reward:
             metrics |= self._improve_reward(inner, data, a_ex)
 
-        metrics |= self._phi.fit(data, proxy_return, "proxy_value")
-        metrics |= self._varphi.fit(data, extrinsic_return, "value")
+        metrics |= self._phi.fit(data, data.state, proxy_return, "proxy_value")
+        metrics |= self._varphi.fit(data, data.state, extrinsic_return, "value")
         return to_floats(metrics)
 
     def _improve_policy(self, batch: Batch, data: Data) -> tuple[Inner, Tensor, dict[str, Tensor]]:
         """θ → θ' on the proxy advantage; returns the last step, the proxy returns and figures."""
-        value, target = self._phi.values(data)
+        value, target = self._phi.values(data, data.state)
         eta, r_in = self._intrinsic_reward(data)
         proxy_return = self._proxy_return(data, r_in.detach(), target)
         a_proxy = self._advantage(data, proxy_return, value)
@@ -161,13 +161,7 @@ class Liir(ActorCritic):
 
     def parameter_counts(self) -> dict[str, int]:
         """Parameters of each network and the budget of all but θ."""
-        return {
-            "theta": self._policy.theta.numel(),
-            "eta": self._eta.numel(),
-            "phi": self._phi.size,
-            "varphi": self._varphi.size,
-            "budget": coma_critic_size(self._spec),
-        }
+        return super().parameter_counts() | {"eta": self._eta.numel(), "phi": self._phi.size}
 
     def state(self) -> dict[str, Tensor]:
         """As the base class, with the pending step of fresh outer samples."""

@@ -114,6 +114,18 @@ class AgentValue(Mlp):
         return _above(first.flatten(0, 1), *above).view(first.shape[:2])
 
 
+class LocalValue(Mlp):
+    """V(o_i, i): one value per agent, dead or alive, from its own observation and id."""
+
+    def __init__(self, spec: EnvSpec, hidden: int) -> None:
+        super().__init__(spec.obs_dim + spec.n_agents, hidden, 1)
+
+    def __call__(self, flat: Tensor, x: Tensor) -> Tensor:
+        """Values [M, n] of observations [M, n, O]."""
+        ids = torch.eye(x.shape[1], dtype=x.dtype, device=x.device).expand(len(x), -1, -1)
+        return super().__call__(flat, torch.cat([x, ids], -1)).squeeze(-1)
+
+
 class IntrinsicReward(Mlp):
     """r_in(η; s_i, u_i) for every action, squashed to ± bound."""
 
@@ -148,13 +160,20 @@ class _Above(torch.autograd.Function):
 _above: Callable[..., Tensor] = _Above.apply
 
 
-def coma_critic_size(spec: EnvSpec) -> int:
-    """Parameters of COMA's critic, 128 - 128, the budget of everything beside the policy (section 5.2.1).
+class CounterfactualValue(Mlp):
+    """COMA's critic Q_i(s, u_-i, ·), 128 - 128: all of an agent's actions at once, the others' being given.
 
-    It sees the state, the observation, all agents' actions and last actions, and the agent's id.
+    It sees the state, the agent's observation, all agents' actions but its own, all last actions, and its id.
     """
-    inputs = spec.state_dim + spec.obs_dim + spec.n_agents * (2 * spec.n_actions + 1)
-    return count(Mlp(inputs, 128, spec.n_actions).shapes)
+
+    def __init__(self, spec: EnvSpec) -> None:
+        inputs = spec.state_dim + spec.obs_dim + spec.n_agents * (2 * spec.n_actions + 1)
+        super().__init__(inputs, 128, spec.n_actions)
+
+
+def coma_critic_size(spec: EnvSpec) -> int:
+    """Parameters of COMA's critic, the budget of everything beside the policy (section 5.2.1)."""
+    return count(CounterfactualValue(spec).shapes)
 
 
 def fit_width(budget: int, size: Callable[[int], int]) -> int:

@@ -1,0 +1,42 @@
+"""Independent actor-critic: each agent has an advantage of its own (Foerster et al., AAAI 2018).
+
+An agent's critic sees what the agent sees, V(o_i, i), and is shared among the agents like the policy. To
+each of them the others are a part of the environment.
+"""
+
+from __future__ import annotations
+
+import torch
+
+from liir_common.config import AlgorithmConfig
+from liir_common.types import Batch, EnvSpec
+from services.learner.algorithms.actor_critic import ActorCritic
+from services.learner.algorithms.data import observations
+from services.learner.algorithms.metrics import to_floats
+from services.learner.algorithms.networks import LocalValue, coma_critic_size, count, fit_width
+
+
+class Iac(ActorCritic):
+    """Policy θ and local value ϕ, which alone has the size that η, φ and ϕ of LIIR have together."""
+
+    def __init__(
+        self, spec: EnvSpec, config: AlgorithmConfig, seed: int, device: torch.device, dtype: torch.dtype
+    ) -> None:
+        width = fit_width(coma_critic_size(spec), lambda width: count(LocalValue(spec, width).shapes))
+        super().__init__(spec, config, seed, device, dtype, LocalValue(spec, width))
+
+    def update(self, batch: Batch) -> dict[str, float]:
+        """One learner step on `batch`; returns its figures.
+
+        The team's reward goes on after an agent's death, and so do its returns: the dead see zeros.
+
+        Raises:
+            ValueError: the batch does not fit (see `check`); nothing has changed then.
+            FloatingPointError: learning has diverged.
+        """
+        data = self._prepare(batch)
+        obs = observations(batch, data)
+        value, target = self._varphi.values(data, obs)
+        returns = self._return(data, data.reward, target)
+        _, _, metrics = self._policy.advance(data, self._advantage(data, returns, value))
+        return to_floats(metrics | self._varphi.fit(data, obs, returns, "value"))

@@ -1,0 +1,84 @@
+"""The replay on disk: what is new is appended, nothing is written twice.
+
+Each file `replay-FIRST-STOP.safetensors` holds the episodes FIRST … STOP-1 of the run, as the frames that the
+replay has in memory. A saved state has its first so many episodes in files that were written before it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save
+
+from liir_common.errors import CorruptError
+from liir_common.files import write_atomic
+
+
+class ReplayStore:
+    """The files of one run; nobody else may write to them."""
+
+    def __init__(self, path: Path) -> None:
+        """Go on with the files in the directory `path`."""
+        self._path = path
+
+    @property
+    def stop(self) -> int:
+        """Number after that of the newest episode on disk; 0 if there is none."""
+        return max((stop for _, stop, _ in self._files()), default=0)
+
+    def append(self, first: int, frames: Sequence[bytes]) -> None:
+        """Keep the episodes from `first` on."""
+        if frames:
+            data = torch.frombuffer(bytearray(b"".join(frames)), dtype=torch.uint8)
+            sizes = torch.tensor([len(frame) for frame in frames])
+            name = f"replay-{first:09d}-{first + len(frames):09d}.safetensors"
+            write_atomic(self._path / name, save({"frames": data, "sizes": sizes}))
+
+    def load(self, first: int, stop: int) -> list[bytes]:
+        """The episodes `first` … `stop` - 1; later ones, which no state knows, are removed.
+
+        Raises:
+            CorruptError: some are missing or cannot be read.
+        """
+        frames: dict[int, bytes] = {}
+        for start, end, path in self._files():
+            if start >= stop:
+                path.unlink()
+            elif end > first:
+                frames |= enumerate(_read(path), start)
+        missing = [episode for episode in range(first, stop) if episode not in frames]
+        if missing:
+            raise CorruptError(
+                f"{len(missing)} episodes of the replay, from {missing[0]} on, are missing under "
+                f"{self._path}; restore them from a backup, or remove all states to train from the start"
+            )
+        return [frames[episode] for episode in range(first, stop)]
+
+    def prune(self, before: int) -> None:
+        """Remove the files that have no episode from number `before` on."""
+        for _, stop, path in self._files():
+            if stop <= before:
+                path.unlink()
+
+    def _files(self) -> list[tuple[int, int, Path]]:
+        found = [
+            (re.fullmatch(r"replay-(\d+)-(\d+)", path.stem), path)
+            for path in self._path.glob("replay-*.safetensors")
+        ]
+        return sorted((int(match[1]), int(match[2]), path) for match, path in found if match)
+
+
+def _read(path: Path) -> list[bytes]:
+    try:
+        tensors = load_file(path)
+    except SafetensorError as error:
+        raise CorruptError(
+            f"{path} cannot be read ({error}); restore it from a backup, or remove all states to train "
+            "from the start"
+        ) from None
+    parts = tensors["frames"].split_with_sizes(tensors["sizes"].tolist())
+    return [part.numpy().tobytes() for part in parts]

@@ -96,27 +96,32 @@ def ids(*shape: int) -> Tensor:
     return torch.eye(SPEC.n_agents, dtype=torch.float64).expand(*shape, SPEC.n_agents, SPEC.n_agents)
 
 
-def policy_probabilities(theta: Tensor, batch: Batch, hidden: int) -> Tensor:
-    """π [B, T, n, A]: GRU from h = 0 over every step, padding and dead agents included."""
+def network_outputs(theta: Tensor, batch: Batch, hidden: int) -> Tensor:
+    """[B, T+1, n, A], not masked: GRU from h = 0 over every step, padding and dead agents included."""
     p = unflatten(theta, policy_shapes(SPEC, hidden))
     episodes, steps, n = batch.log_mu.shape
     h = torch.zeros(episodes, n, hidden, dtype=theta.dtype)
     last = torch.zeros(episodes, n, SPEC.n_actions, dtype=theta.dtype)
     out = []
-    for t in range(steps):
+    for t in range(steps + 1):
         x = torch.cat([t64(batch.obs[:, t]), last, ids(episodes)], -1)
         x = torch.relu(x @ p["fc1.weight"].T + p["fc1.bias"])
         i_r, i_z, i_n = (x @ p["gru.weight_ih"].T + p["gru.bias_ih"]).chunk(3, -1)
         h_r, h_z, h_n = (h @ p["gru.weight_hh"].T + p["gru.bias_hh"]).chunk(3, -1)
         r, z = torch.sigmoid(i_r + h_r), torch.sigmoid(i_z + h_z)
         h = (1 - z) * torch.tanh(i_n + r * h_n) + z * h
-        mask = torch.as_tensor(batch.mask[:, t])
-        logits = (h @ p["fc2.weight"].T + p["fc2.bias"]).masked_fill(~mask, -1e30)
-        softmax = torch.softmax(logits, -1)
-        floor = batch.epsilon * mask.double() / mask.sum(-1, keepdim=True)
-        out.append((1 - batch.epsilon) * softmax + floor)
-        last = torch.eye(SPEC.n_actions, dtype=theta.dtype)[batch.actions[:, t]]
+        out.append(h @ p["fc2.weight"].T + p["fc2.bias"])
+        if t < steps:
+            last = torch.eye(SPEC.n_actions, dtype=theta.dtype)[batch.actions[:, t]]
     return torch.stack(out, 1)
+
+
+def policy_probabilities(theta: Tensor, batch: Batch, hidden: int) -> Tensor:
+    """π [B, T, n, A]"""
+    mask = torch.as_tensor(batch.mask[:, :-1])
+    logits = network_outputs(theta, batch, hidden)[:, :-1].masked_fill(~mask, -1e30)
+    floor = batch.epsilon * mask.double() / mask.sum(-1, keepdim=True)
+    return (1 - batch.epsilon) * torch.softmax(logits, -1) + floor
 
 
 def log_pi_of(pi: Tensor, batch: Batch) -> Tensor:

@@ -30,8 +30,39 @@ def test_preset_fills_what_is_not_written() -> None:
     assert strong.env.options["reward_only_positive"] is True
 
 
-def test_algorithm_may_be_its_name() -> None:
+def test_algorithm_may_be_its_name(tmp_path: Path) -> None:
     assert config.load(None, ["algorithm=central_v"]).algorithm.name == "central_v"
+    file = tmp_path / "run.yaml"
+    file.write_text("algorithm: qmix\n")
+    assert config.load(file).algorithm.name == "qmix"
+    for settings in (["algorithm.gamma=0.9"], ["algorithm=qmix", "algorithm.gamma=0.9"]):
+        algorithm = config.load(file, settings).algorithm
+        assert (algorithm.name, algorithm.gamma) == ("qmix", 0.9)
+    assert config.load(file, ["algorithm=iac"]).algorithm.name == "iac"
+
+
+@pytest.mark.parametrize("preset", ["strong", "paper"])
+def test_methods_bring_their_settings_and_leave_the_reward_to_the_preset(preset: str) -> None:
+    coma, qmix, iac, central_v = (
+        config.load(None, [f"preset={preset}", f"algorithm={name}"])
+        for name in ("coma", "qmix", "iac", "central_v")
+    )
+    assert coma.algorithm.policy_optimizer.name == qmix.algorithm.policy_optimizer.name == "rmsprop"
+    assert (coma.algorithm.policy_epochs, coma.algorithm.entropy) == (1, 0)
+    assert (qmix.algorithm.exploration.start, qmix.algorithm.exploration.end) == (1, 0.05)
+    assert qmix.algorithm.replay.episodes_per_update == 8
+    assert qmix.env == coma.env == iac.env
+    assert iac.algorithm == central_v.algorithm.model_copy(update={"name": "iac"})
+    assert config.load(None, ["algorithm=qmix", "algorithm.gae_lambda=0.5"]).algorithm.gae_lambda == 0.5
+
+
+def test_how_actors_choose_follows_from_the_method() -> None:
+    behaviours = {
+        name: str(config.load(None, [f"algorithm={name}"]).algorithm.behaviour)
+        for name in ("liir", "central_v", "iac", "coma", "iql", "vdn", "qmix")
+    }
+    assert {name for name, how in behaviours.items() if how == "epsilon_greedy"} == {"iql", "vdn", "qmix"}
+    assert set(behaviours.values()) == {"epsilon_greedy", "softmax_floor"}
 
 
 def test_tree_round_trip_ignores_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -49,6 +80,8 @@ def test_tree_round_trip_ignores_the_environment(monkeypatch: pytest.MonkeyPatch
         ("training.lag=2", "training.lag: Input should be less than or equal to 1; got 2"),
         ("training.total_env_steps=many", "training.total_env_steps"),
         ("preset=strongest", "'strong', 'paper' or 'none'"),
+        ("algorithm.replay.episodes=31", "batch_episodes wants to be at most episodes (31), got 32"),
+        ("algorithm={name: coma, limit_is_terminal: false}", "coma wants limit_is_terminal"),
         ("seed", "--set wants key.sub=value, got 'seed'"),
         ("seed=[", "not YAML"),
     ],

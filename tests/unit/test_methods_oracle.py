@@ -297,7 +297,7 @@ def test_value_based_update_equals_the_formulas(case: str) -> None:
     wanted = Preconditioner(renamed, config)(-gradient)
     metrics = algorithm.update(batch)
     close(algorithm.state()["q.parameters"] - before["q.parameters"], wanted, 1e-9)
-    assert metrics["q_loss"] == pytest.approx(float(loss), rel=1e-12)
+    assert metrics["q_loss"] == pytest.approx(loss.item(), rel=1e-12)
     assert (metrics["policy_gradient_norm"] > config.policy_optimizer.clip) == ("clipped" in case)
 
 

@@ -191,13 +191,16 @@ def test_the_dead_still_teach_the_values(method: str) -> None:
     assert not any(torch.equal(base.state()[name], other.state()[name]) for name in names)
 
 
-def test_targets_are_copied_at_every_interval() -> None:
-    algorithm = make("liir paper")
+@pytest.mark.parametrize(
+    ("method", "part"), [("liir paper", "phi"), ("liir paper", "varphi"), ("coma", "varphi"), ("iql", "q")]
+)
+def test_targets_are_copied_at_every_interval(method: str, part: str) -> None:
+    algorithm = make(method)
     followed = []
     for seed in range(7):
         algorithm.update(batch_of(seed))
         state = algorithm.state()
-        followed.append(torch.equal(state["phi.target"], state["phi.parameters"]))
+        followed.append(torch.equal(state[f"{part}.target"], state[f"{part}.parameters"]))
     assert followed == [False, False, True, False, False, True, False]
 
 

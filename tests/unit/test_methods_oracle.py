@@ -289,6 +289,8 @@ def q_loss(parameters: Tensor, target: Tensor, batch: Batch, config: AlgorithmCo
 def test_value_based_update_equals_the_formulas(case: str) -> None:
     algorithm, before, config = warmed(case, VALUE_BASED[case])
     batch = batch_of(9, 9)
+    # To the dead only what they did is open, whatever their mask says.
+    batch.alive[:, 1, 1:] = False
     parameters = before["q.parameters"].clone().requires_grad_()
     target = before["q.target" if config.target_interval else "q.parameters"]
     loss = q_loss(parameters, target, batch, config)
@@ -299,6 +301,31 @@ def test_value_based_update_equals_the_formulas(case: str) -> None:
     close(algorithm.state()["q.parameters"] - before["q.parameters"], wanted, 1e-9)
     assert metrics["q_loss"] == pytest.approx(loss.item(), rel=1e-12)
     assert (metrics["policy_gradient_norm"] > config.policy_optimizer.clip) == ("clipped" in case)
+
+
+def test_every_update_draws_other_episodes_and_there_are_as_many_as_configured(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    replay = {"replay": {"episodes": 20, "batch_episodes": 7, "episodes_per_update": 4}}
+    config = AlgorithmConfig.model_validate(BASE | METHOD_PRESETS["iql"] | replay | {"name": "iql"})
+    algorithm = make_algorithm(SPEC, config, 5, CPU)
+    assert algorithm.replay is not None
+    draws: list[list[int]] = []
+    sample = algorithm.replay.sample
+    monkeypatch.setattr(
+        algorithm.replay, "sample", lambda places: draws.append(list(places)) or sample(places)
+    )
+    made = []
+    for seed in range(6):
+        before = len(draws)
+        figures = algorithm.update(batch_of(seed, seed))
+        made.append(len(draws) - before)
+        assert bool(figures) == bool(made[-1])
+    # Six episodes a batch: 6, 12, 18, … of them, the first too few to draw seven from.
+    assert made == [0, 2, 1, 2, 1, 2]
+    assert all(places == sorted(set(places)) and len(places) == 7 for places in draws)
+    assert len({tuple(places) for places in draws}) == len(draws)
+    assert max(max(places) for places in draws[-3:]) > 12
 
 
 def random(*shape: int, seed: int) -> Tensor:

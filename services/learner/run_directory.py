@@ -1,7 +1,7 @@
 """The run directory: everything a run leaves on disk, and what it needs to go on.
 
 config.yaml      the resolved configuration
-run.json         run id, build, environment
+run.json         run id, build, environment, parameter counts
 endpoints.json   where the learner listens while it runs
 state/           the learner's own state at the last saves, and the replay if the method has one
 checkpoints/     frozen checkpoints
@@ -63,7 +63,7 @@ class RunDirectory:
         (path / "state").mkdir(parents=True, exist_ok=True)
         if not (path / "run.json").exists():
             self._write_json("run.json", {"run_id": uuid.uuid4().hex, "created": time.time()})
-        record = json.loads((path / "run.json").read_text())
+        record = self._read_record()
         if record.get("env_spec_hash", spec.hash) != spec.hash:
             raise ConfigError(
                 f"{path} was trained on {record['env_spec']}, this build and configuration play "
@@ -81,6 +81,10 @@ class RunDirectory:
         self.replay = ReplayStore(path / "state")
         self.metrics = Table(path / "metrics.csv")
         self.evaluations = Table(path / "evaluations.csv")
+
+    def write_parameters(self, counts: Mapping[str, int]) -> None:
+        """Record how many parameters each network has."""
+        self._write_json("run.json", self._read_record() | {"parameters": dict(counts)})
 
     def write_endpoints(self, endpoints: Mapping[str, Any]) -> None:
         """Say where this learner listens, for whoever starts the other processes."""
@@ -124,6 +128,10 @@ class RunDirectory:
                 "them all to train from the start"
             )
         return None
+
+    def _read_record(self) -> dict[str, Any]:
+        record: dict[str, Any] = json.loads((self.path / "run.json").read_text())
+        return record
 
     def _state_path(self, step: int) -> Path:
         return self.path / "state" / f"state-{step:09d}.safetensors"

@@ -46,6 +46,7 @@ async def serve(config: Config, run: RunDirectory, spec: EnvSpec) -> None:
         spec, config.algorithm, seeds.derive(config.seed, seeds.LEARNER), device(config.learner.device)
     )
     log.info("parameters", **algorithm.parameter_counts())
+    run.write_parameters(algorithm.parameter_counts())
 
     def publish(opening: Opening, weights: Weights) -> None:
         loop.call_soon_threadsafe(rollouts.publish, opening, weights)

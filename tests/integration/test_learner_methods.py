@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import threading
 from pathlib import Path
 
@@ -75,6 +76,8 @@ def test_stopped_and_resumed_is_never_stopped(tmp_path: Path, method: str) -> No
     assert states[1] is not None
     assert all(states[0][1][name].equal(tensor) for name, tensor in states[1][1].items())
     assert "episodes_per_update: 2" in (tmp_path / "parts" / "config.yaml").read_text()
+    record = json.loads((tmp_path / "parts" / "run.json").read_text())
+    assert record["parameters"]["theta"] == 28297
 
 
 class Recorder:

@@ -18,7 +18,7 @@ _HEAD = struct.Struct("<i??")
 
 
 class Replay:
-    """A ring of episodes, each one a zstd frame without padding: less than half the size, and every bit kept.
+    """A ring of episodes, each one a zstd frame without padding: a seventh of the size, and every bit kept.
 
     Episodes have numbers from 0 on, over the whole run; the newest `capacity` of them are here.
     """

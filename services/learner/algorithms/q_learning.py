@@ -80,7 +80,8 @@ class QLearning:
         self._steps, self._updates = torch.zeros(2, dtype=torch.int64).unbind()
         # A signed integer holds one bit less than a seed has.
         self._seed = torch.tensor(seeds.derive(seed, SAMPLES) >> 1)
-        self.replay: Replay | None = Replay(spec, config.replay.episodes)
+        self._episodes = Replay(spec, config.replay.episodes)
+        self.replay: Replay | None = self._episodes
 
     def policy(self) -> dict[str, NDArray[np.float32]]:
         """float32 copies of the Q network under the names and shapes of `policy_shapes`."""
@@ -116,27 +117,23 @@ class QLearning:
             FloatingPointError: learning has diverged.
         """
         check(batch, self._spec)
-        assert self.replay is not None
-        config, before = self._config.replay, self.replay.total
-        self.replay.add(batch)
-        updates = self.replay.total // config.episodes_per_update - before // config.episodes_per_update
+        config, before = self._config.replay, self._episodes.total
+        self._episodes.add(batch)
+        updates = self._episodes.total // config.episodes_per_update - before // config.episodes_per_update
         metrics: dict[str, Tensor] = {}
-        if len(self.replay) >= config.batch_episodes:
+        if len(self._episodes) >= config.batch_episodes:
             for _ in range(updates):
-                metrics = self._learn(self._sample(self.replay))
+                metrics = self._learn(self._sample())
         self._steps += 1
         if self._config.target_interval and int(self._steps) % self._config.target_interval == 0:
             self._target.copy_(self._parameters)
         return to_floats(metrics) if metrics else {}
 
-    def _sample(self, episodes: Replay) -> Sample:
+    def _sample(self) -> Sample:
         random = np.random.default_rng([int(self._seed), int(self._updates)])
-        places = random.choice(len(episodes), self._config.replay.batch_episodes, replace=False)
+        places = random.choice(len(self._episodes), self._config.replay.batch_episodes, replace=False)
         self._updates += 1
-        batch = episodes.sample(sorted(places.tolist()))
-        return self._prepare(batch)
-
-    def _prepare(self, batch: Batch) -> Sample:
+        batch = self._episodes.sample(sorted(places.tolist()))
         whole = everybody(batch, limit_is_terminal=self._config.limit_is_terminal)
         device, dtype = self._device, self._dtype
         data = prepare(whole, self._spec, limit_is_terminal=True, device=device, dtype=dtype)

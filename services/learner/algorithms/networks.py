@@ -111,7 +111,7 @@ class AgentValue(Mlp):
         of_state, of_id = w1.split_with_sizes([x.shape[1], w1.shape[1] - x.shape[1]], 1)
         # The state's part of the first layer is the same for all agents of a step.
         first = functional.linear(x, of_state, b1).unsqueeze(1) + of_id.t().contiguous()
-        return _above(first.flatten(0, 1), *above).view(first.shape[:2])
+        return _above(first, *above).squeeze(-1)
 
 
 class LocalValue(Mlp):
@@ -138,6 +138,17 @@ class IntrinsicReward(Mlp):
         return self._bound * torch.tanh(super().__call__(flat, x) / self._bound)
 
 
+class CounterfactualValue(Mlp):
+    """COMA's critic Q_i(s, u_-i, ·), 128 - 128: all of an agent's actions at once, the others' being given.
+
+    It sees the state, the agent's observation, all agents' actions but its own, all last actions, and its id.
+    """
+
+    def __init__(self, spec: EnvSpec) -> None:
+        inputs = spec.state_dim + spec.obs_dim + spec.n_agents * (2 * spec.n_actions + 1)
+        super().__init__(inputs, 128, spec.n_actions)
+
+
 class _Above(torch.autograd.Function):
     """The layers above the first, from its outputs [M, H] before the ReLU; written out because autograd's
     own ReLUs cost as much as the matrix products."""
@@ -157,18 +168,12 @@ class _Above(torch.autograd.Function):
         return by_h1, by_h2.t() @ h1, by_h2.sum(0), grad.t() @ h2, grad.sum(0)
 
 
-_above: Callable[..., Tensor] = _Above.apply
+_apply: Callable[..., Tensor] = _Above.apply
 
 
-class CounterfactualValue(Mlp):
-    """COMA's critic Q_i(s, u_-i, ·), 128 - 128: all of an agent's actions at once, the others' being given.
-
-    It sees the state, the agent's observation, all agents' actions but its own, all last actions, and its id.
-    """
-
-    def __init__(self, spec: EnvSpec) -> None:
-        inputs = spec.state_dim + spec.obs_dim + spec.n_agents * (2 * spec.n_actions + 1)
-        super().__init__(inputs, 128, spec.n_actions)
+def _above(first: Tensor, *parameters: Tensor) -> Tensor:
+    """Outputs [..., outputs] of the network whose first layer gave `first` [..., H]."""
+    return _apply(first.flatten(0, -2), *parameters).view(*first.shape[:-1], -1)
 
 
 def coma_critic_size(spec: EnvSpec) -> int:

@@ -621,7 +621,7 @@ def test_longer_steps_and_moves() -> None:
     stage(env, {("ally", 0): {"x": 15.0, "y": 15.0}, ("enemy", 0): FAR})
     play(env, {0: EAST})
     assert unit(env, "ally", 0)["x"] == pytest.approx(16.0), "where the order led"
-    assert env._battle.clock[0] == 2 + 16
+    assert env._battle.clock[0] == Settings().head_start + 16
 
 
 def test_terrains_have_cut_corners() -> None:

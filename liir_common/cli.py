@@ -50,7 +50,7 @@ def train(
     logs.configure("train")
     path = run_dir or (_newest_run() if resume else None)
     resolved = options.load_run_config(config, settings, path, resume)
-    path = path or Path("runs") / _run_name(resolved.env.map, resolved.algorithm.name, resolved.seed)
+    path = path or Path("runs") / _run_name(resolved.env.label, resolved.algorithm.name, resolved.seed)
     arguments = [] if config is None or resume else ["--config", str(config)]
     arguments += [part for setting in settings or () for part in ("--set", setting)]
     launcher = Launcher(path, arguments, resume)
@@ -61,8 +61,8 @@ def train(
         raise SystemExit(128 + launcher.stop_signal)
 
 
-def _run_name(map_name: str, algorithm: str, seed: int) -> str:
-    return f"{map_name}-{algorithm}-seed{seed}-{time.strftime('%Y%m%d-%H%M%S')}"
+def _run_name(env: str, algorithm: str, seed: int) -> str:
+    return f"{env}-{algorithm}-seed{seed}-{time.strftime('%Y%m%d-%H%M%S')}"
 
 
 def _newest_run() -> Path:

@@ -33,13 +33,24 @@ class Section(BaseModel):
 class EnvConfig(Section):
     """What is played."""
 
-    kind: Literal["battle", "pettingzoo"] = "battle"
+    kind: Literal["battle", "smac", "pettingzoo"] = "battle"
+    """Our simulator, StarCraft II through the package smac, or any game with one team reward."""
     map: str = "3m"
-    """Battle map (`liir maps`)."""
+    """Map of kinds battle (`liir maps`) and smac."""
     factory: str = ""
     """With kind pettingzoo: `module:function` that returns a ParallelEnv with one team reward."""
     options: dict[str, bool | int | float | str] = {}
     """Keyword arguments of the environment, for example reward_only_positive."""
+
+    @property
+    def label(self) -> str:
+        """Short name for directories and metrics: 3m, smac-3m, or the module of the factory."""
+        names = {
+            "battle": self.map,
+            "smac": f"smac-{self.map}",
+            "pettingzoo": self.factory.partition(":")[0].rpartition(".")[2],
+        }
+        return names[self.kind]
 
 
 class ExplorationConfig(Section):
@@ -222,10 +233,12 @@ class Config(BaseSettings):
     def _fill_preset(cls, data: dict[str, Any]) -> dict[str, Any]:
         data = _spelled_out(data)
         preset = str(data.get("preset", "strong"))
-        algorithm = data.get("algorithm")
-        name = algorithm.get("name") if isinstance(algorithm, Mapping) else None
-        of_method = METHOD_PRESETS.get(str(name), {}) if preset != "none" else {}
-        return merge(merge(PRESETS.get(preset, {}), {"algorithm": of_method}), data)
+        filled = PRESETS.get(preset, {})
+        of_method = METHOD_PRESETS.get(_named(data, "algorithm", "name"), {}) if preset != "none" else {}
+        if _named(data, "env", "kind") == "pettingzoo":
+            # Its options are SMAC's, which no other game takes.
+            filled = {section: values for section, values in filled.items() if section != "env"}
+        return merge(merge(filled, {"algorithm": of_method}), data)
 
     @classmethod
     def settings_customise_sources(
@@ -352,9 +365,18 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _spelled_out(tree: dict[str, Any]) -> dict[str, Any]:
-    """`algorithm: qmix` is short for `algorithm: {name: qmix}`."""
-    name = tree.get("algorithm")
-    return tree | {"algorithm": {"name": name}} if isinstance(name, str) else tree
+    """`algorithm: qmix` is short for `algorithm: {name: qmix}`, and `env: smac` for `env: {kind: smac}`."""
+    short = {"algorithm": "name", "env": "kind"}
+    return {
+        key: {short[key]: value} if key in short and isinstance(value, str) else value
+        for key, value in tree.items()
+    }
+
+
+def _named(data: Mapping[str, Any], section: str, key: str) -> str:
+    """`data[section][key]` before validation, when anything may be missing."""
+    values = data.get(section)
+    return str(values.get(key, "")) if isinstance(values, Mapping) else ""
 
 
 def parse_settings(settings: Sequence[str]) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any, TypedDict
 
 import numpy as np
-from gymnasium.spaces import Box, Dict, Discrete
+from gymnasium.spaces import Box, Dict
 from numpy.typing import NDArray
 from pettingzoo.utils.env import ParallelEnv
 
@@ -17,18 +17,22 @@ from liir_common.battle.parameters import resolve
 from liir_common.battle.policies import make_buffers
 from liir_common.battle.render import draw_ansi, draw_rgb
 from liir_common.battle.scenarios import find_scenario
+from liir_common.battle.spaces import (
+    INFO_KEYS,
+    AvailableActions,
+    Observation,
+    joint_action,
+    masked_observations,
+)
 from liir_common.battle.tables import build_battle, build_tables, roster
 from liir_common.battle.units import ENERGY_MAX
 from liir_common.types import EnvSpec
 
-INFO_KEYS = ("won", "dead_allies", "dead_enemies")
 _STATUS_OF_INFO = {
     "won": engine.WON,
     "dead_allies": engine.DEAD_ALLIES,
     "dead_enemies": engine.DEAD_ENEMIES,
 }
-
-Observation = dict[str, Any]
 
 
 class UnitRecord(TypedDict):
@@ -56,28 +60,12 @@ class UnitRecord(TypedDict):
     """Number of the unit attacked, within the other team; of the unit healed, within its own"""
 
 
-class AvailableActions(Discrete):
-    """Discrete actions of which `sample` without a mask draws one that is available now."""
-
-    def __init__(self, available: NDArray[np.int8]) -> None:
-        super().__init__(len(available))
-        self.available = available
-        """[A], owned and kept up to date by the environment"""
-
-    def sample(
-        self, mask: NDArray[np.int8] | None = None, probability: NDArray[Any] | None = None
-    ) -> np.int64:
-        """One action; at random among the available ones unless a mask or probabilities say otherwise."""
-        if mask is None and probability is None:
-            mask = self.available
-        return super().sample(mask, probability)
-
-
 class BattleEnv(ParallelEnv[str, Observation, np.int64]):
     """Micromanagement battle with SMAC v1's rules, actions, observations and rewards.
 
     Agents stay listed until the episode ends; a dead one has the no-op as its only action, and
-    `info["alive"]` says so. All agents get the team's reward.
+    `info["alive"]` says so. All agents get the team's reward. The action mask is in the observation, and
+    again in the info for those who wrap observations.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012  # PettingZoo declares it so
@@ -86,12 +74,14 @@ class BattleEnv(ParallelEnv[str, Observation, np.int64]):
         "render_fps": 2.8,
         "is_parallelizable": True,
     }
+    info_keys = INFO_KEYS
 
     def __init__(self, map_name: str, render_mode: str | None = None, **options: Any) -> None:
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode wants one of {self.metadata['render_modes']}, got {render_mode!r}")
         scenario, settings = find_scenario(map_name), resolve(options)
         self.render_mode = render_mode
+        self.episode_limit = scenario.limit
         self._unit_types = [unit.name for unit in roster(scenario, settings)[0]]
         self._tables = build_tables(scenario, settings)
         self._battle = build_battle(self._tables)
@@ -103,14 +93,10 @@ class BattleEnv(ParallelEnv[str, Observation, np.int64]):
         self._action_spaces = {
             a: AvailableActions(self._masks[i]) for i, a in enumerate(self.possible_agents)
         }
-        self._observation_spaces = {a: self._observation_space() for a in self.possible_agents}
-        self.state_space = Box(-np.inf, np.inf, self._buffers.state.shape, np.float32)
-
-    def _observation_space(self) -> Dict:
-        obs, mask = self._buffers.obs[0], self._masks[0]
-        return Dict(
-            {"observation": Box(-1, 1, obs.shape, np.float32), "action_mask": Box(0, 1, mask.shape, np.int8)}
+        self._observation_spaces = dict.fromkeys(
+            self.possible_agents, masked_observations(self._buffers.obs.shape[1], n_actions)
         )
+        self.state_space = Box(-np.inf, np.inf, self._buffers.state.shape, np.float32)
 
     def observation_space(self, agent: str) -> Dict:
         """The observation in [-1, 1] and the action mask of one agent."""
@@ -156,7 +142,7 @@ class BattleEnv(ParallelEnv[str, Observation, np.int64]):
         """
         if not self.agents:
             raise RuntimeError("no episode is running; call reset() before step()")
-        reward = engine.step(self._tables, self._battle, self._checked(actions))
+        reward = engine.step(self._tables, self._battle, joint_action(actions, self._action_spaces))
         self._observe()
         status = self._battle.status
         results = (
@@ -169,17 +155,6 @@ class BattleEnv(ParallelEnv[str, Observation, np.int64]):
         if status[engine.TERMINATED] or status[engine.TRUNCATED]:
             self.agents = []
         return results
-
-    def _checked(self, actions: dict[str, Any]) -> NDArray[np.int64]:
-        if set(actions) != set(self.agents):
-            raise ValueError(f"step wants one action for each of {self.agents}, got {sorted(actions)}")
-        for agent, mask in zip(self.agents, self._masks, strict=True):
-            if not (actions[agent] in self._action_spaces[agent] and mask[actions[agent]]):
-                raise ValueError(
-                    f"action {actions[agent]!r} of {agent} is not available; "
-                    f"its mask allows {np.flatnonzero(mask).tolist()}"
-                )
-        return np.array([actions[agent] for agent in self.agents], np.int64)
 
     def state(self) -> NDArray[np.float32]:
         """SMAC v1's global state [S]."""
@@ -293,8 +268,8 @@ class BattleEnv(ParallelEnv[str, Observation, np.int64]):
         ended = status[engine.TERMINATED] or status[engine.TRUNCATED]
         outcome = {key: float(status[at]) for key, at in _STATUS_OF_INFO.items()} if ended else {}
         return {
-            agent: {"alive": bool(alive), **outcome}
-            for agent, alive in zip(self.agents, self._buffers.alive, strict=True)
+            agent: {"alive": bool(alive), "action_mask": mask.copy(), **outcome}
+            for agent, alive, mask in zip(self.agents, self._buffers.alive, self._masks, strict=True)
         }
 
 

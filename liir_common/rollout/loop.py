@@ -22,9 +22,10 @@ NO_OP = 0
 class LoopPlayer(Player):
     """Plays through the PettingZoo interface.
 
-    Observations are a Box, or a Dict of "observation" and "action_mask". An agent that leaves
-    `env.agents` is dead: it observes zeros and has only action 0. An env that keeps its dead listed
-    says so with info["alive"].
+    Observations are a Box, or a Dict of "observation" and "action_mask". With a Box the mask is
+    info["action_mask"], or without one every action is available. An agent that leaves `env.agents` is
+    dead: it observes zeros and has only action 0. An env that keeps its dead listed says so with
+    info["alive"].
     """
 
     def __init__(self, env: Env, spec: EnvSpec, policy_hidden: int) -> None:
@@ -91,12 +92,11 @@ class LoopPlayer(Player):
         self._rows.state[step] = _state(self._env, self._rows.obs[step])
 
     def _look_as(self, i: int, step: int, observation: Any, info: Mapping[str, Any]) -> None:
+        mask = info.get("action_mask", True)
         if isinstance(observation, Mapping):
-            self._rows.obs[step, i] = np.ravel(observation["observation"])
-            self._rows.mask[step, i] = observation["action_mask"]
-        else:
-            self._rows.obs[step, i] = np.ravel(observation)
-            self._rows.mask[step, i] = True
+            observation, mask = observation["observation"], observation["action_mask"]
+        self._rows.obs[step, i] = np.ravel(observation)
+        self._rows.mask[step, i] = mask
         self._rows.alive[step, i] = info.get("alive", True)
 
     def _look_dead(self, i: int, step: int) -> None:
@@ -123,7 +123,7 @@ def _state(env: Env, obs: FloatArray) -> FloatArray:
 
 
 def loop_spec(env: Env, name: str, options: Mapping[str, Any]) -> EnvSpec:
-    """What `env` looks like from outside; it is reset once to see the size of its state.
+    """What `env` looks like from outside; without a `state_space` it is reset once to see its state.
 
     The step limit is the attribute `episode_limit` of the unwrapped environment, or `max_cycles`, as
     PettingZoo's own environments call it; `info_keys`, if there, names the figures of the last info;
@@ -141,8 +141,6 @@ def loop_spec(env: Env, name: str, options: Mapping[str, Any]) -> EnvSpec:
     if len(set(sizes.values())) != 1:
         raise ValueError(f"{name}: wanted equal (observation, action) sizes for all agents, got {sizes}")
     obs_dim, n_actions = next(iter(sizes.values()))
-    env.reset(seed=0)
-    observations = np.zeros((len(sizes), obs_dim), np.float32)
     return EnvSpec(
         name=name,
         version=str(env.metadata.get("name", type(game).__name__)),
@@ -150,10 +148,18 @@ def loop_spec(env: Env, name: str, options: Mapping[str, Any]) -> EnvSpec:
         n_agents=len(sizes),
         n_actions=n_actions,
         obs_dim=obs_dim,
-        state_dim=len(_state(env, observations)),
+        state_dim=_state_dim(env, np.zeros((len(sizes), obs_dim), np.float32)),
         episode_limit=int(limit),
         info_keys=tuple(getattr(game, "info_keys", ())),
     )
+
+
+def _state_dim(env: Env, obs: FloatArray) -> int:
+    space = getattr(env, "state_space", None)
+    if isinstance(space, spaces.Box):
+        return int(np.prod(space.shape))
+    env.reset(seed=0)
+    return len(_state(env, obs))
 
 
 def _obs_dim(env: Env, agent: str) -> int:

@@ -15,6 +15,7 @@ from liir_common.rollout.fused import FusedPlayer
 from liir_common.rollout.loop import Env, LoopPlayer, loop_spec
 from liir_common.rollout.player import Player
 from liir_common.rollout.policy import random_weights
+from liir_common.smac import SmacEnv
 from liir_common.types import EnvSpec, Exploration, Ticket
 
 
@@ -22,13 +23,13 @@ def env_spec(env: EnvConfig) -> EnvSpec:
     """What the configured environment looks like from outside.
 
     Raises:
-        ConfigError: the map, an option or the kind of environment is unknown, or the factory cannot be
-            imported or does not return a ParallelEnv.
+        ConfigError: the map or an option is unknown, SMAC or the factory cannot be imported, or the
+            factory does not return a ParallelEnv.
     """
     try:
         if env.kind == "battle":
             return battle_spec(env.map, **env.options)
-        return loop_spec(_make(env), env.factory, env.options)
+        return loop_spec(_make(env), _name(env), env.options)
     except ConfigError:
         raise
     except ValueError as error:
@@ -41,16 +42,24 @@ def make_player(env: EnvConfig, policy_hidden: int = 64, fused: bool = True) -> 
     Raises:
         ConfigError, ValueError: as `env_spec`.
     """
-    options: dict[str, Any] = dict(env.options)
-    if env.kind == "pettingzoo":
+    if env.kind != "battle":
         game = _make(env)
-        return LoopPlayer(game, loop_spec(game, env.factory, options), policy_hidden)
+        return LoopPlayer(game, loop_spec(game, _name(env), env.options), policy_hidden)
+    options: dict[str, Any] = dict(env.options)
     if fused:
         return FusedPlayer(env.map, options, policy_hidden)
     return LoopPlayer(parallel_env(env.map, **options), env_spec(env), policy_hidden)
 
 
+def _name(env: EnvConfig) -> str:
+    return env.factory if env.kind == "pettingzoo" else f"{env.kind}/{env.map}"
+
+
 def _make(env: EnvConfig) -> Env:
+    return SmacEnv(env.map, **env.options) if env.kind == "smac" else _made_by_factory(env)
+
+
+def _made_by_factory(env: EnvConfig) -> Env:
     module, colon, function = env.factory.partition(":")
     if not (module and colon and function):
         raise ConfigError(f"env.factory: wanted module:function, got {env.factory!r}")
@@ -58,7 +67,12 @@ def _make(env: EnvConfig) -> Env:
         factory = getattr(importlib.import_module(module), function)
     except (ImportError, AttributeError) as error:
         raise ConfigError(f"env.factory: cannot import {env.factory!r}: {error}") from error
-    game = factory(**env.options)
+    try:
+        game = factory(**env.options)
+    except TypeError as error:
+        raise ConfigError(
+            f"env.factory: {env.factory!r} does not work with env.options {env.options}: {error}"
+        ) from error
     if not isinstance(game, ParallelEnv):
         raise ConfigError(f"env.factory: {env.factory!r} wants to return a ParallelEnv, got {game!r}")
     return game

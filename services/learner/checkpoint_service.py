@@ -135,7 +135,7 @@ class CheckpointService(checkpoint_pb2_grpc.CheckpointServiceServicer):
         metrics.EVALUATED_ENV_STEPS.set(newest.env_steps)
         for actions in ("greedy", "sampled"):
             stats = getattr(newest, actions)
-            metrics.WIN_RATE.labels(self._run.config.env.map, actions).set(stats.wins / stats.episodes)
+            metrics.WIN_RATE.labels(self._run.config.env.label, actions).set(stats.wins / stats.episodes)
 
 
 def _limit(asked: int) -> int:

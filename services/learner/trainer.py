@@ -158,8 +158,8 @@ class Trainer:
         row = {**asdict(counters), "time": now, **progress.newest}
         self.run_directory.metrics.append(row)
         steps = sum(t.length for t in trajectories)
-        metrics.ENV_STEPS.labels(self.config.env.map).inc(steps)
-        metrics.EPISODES.labels(self.config.env.map).inc(len(trajectories))
+        metrics.ENV_STEPS.labels(self.config.env.label).inc(steps)
+        metrics.EPISODES.labels(self.config.env.label).inc(len(trajectories))
         metrics.LEARNER_STEP.set(counters.learner_step)
         metrics.EPISODE_RETURN.set(episode_figures["return_mean"])
         metrics.EPISODE_LENGTH.set(episode_figures["length_mean"])

@@ -39,7 +39,8 @@ def play_randomly(env: BattleEnv, seed: int) -> tuple[list[Any], dict[str, dict[
         observations, rewards, terminated, truncated, infos = env.step(actions)
         for part in observations.values():
             seen += [part["observation"].tobytes(), part["action_mask"].tobytes()]
-        seen += [env.state().tobytes(), rewards, terminated, truncated, infos, tuple(actions.values())]
+        outcomes = [{**info, "action_mask": info["action_mask"].tobytes()} for info in infos.values()]
+        seen += [env.state().tobytes(), rewards, terminated, truncated, outcomes, tuple(actions.values())]
     return seen, infos
 
 
@@ -74,7 +75,7 @@ def test_a_reset_without_a_seed_is_fresh() -> None:
 def test_the_last_step_tells_the_outcome() -> None:
     infos = play_randomly(parallel_env("3m"), 1)[1]
     for info in infos.values():
-        assert set(info) == {"alive", *battle_spec("3m").info_keys}
+        assert set(info) == {"alive", "action_mask", *battle_spec("3m").info_keys}
         assert all(isinstance(info[key], float) for key in battle_spec("3m").info_keys)
 
 
@@ -88,6 +89,7 @@ def test_the_dead_stay_listed_with_the_no_op() -> None:
         for agent, info in infos.items():
             mask = observations[agent]["action_mask"]
             assert mask.any()
+            assert np.array_equal(mask, info["action_mask"])
             if not info["alive"]:
                 seen_dead = True
                 assert np.flatnonzero(mask).tolist() == [0]

@@ -41,6 +41,24 @@ def test_algorithm_may_be_its_name(tmp_path: Path) -> None:
     assert config.load(file, ["algorithm=iac"]).algorithm.name == "iac"
 
 
+def test_env_may_be_its_kind(tmp_path: Path) -> None:
+    file = tmp_path / "run.yaml"
+    file.write_text("env: smac\n")
+    assert config.load(file).env.label == "smac-3m"
+    env = config.load(file, ["env.map=8m"]).env
+    assert (env.kind, env.map, env.label) == ("smac", "8m", "smac-8m")
+    assert config.load(None, ["env=smac", "env.map=8m"]).env == env
+    assert config.load(None, ["env.map=8m"]).env.label == "8m"
+
+
+def test_presets_set_options_of_smacs_rules_only() -> None:
+    settings = ["env=pettingzoo", "env.factory=games.pursuit:parallel_env", "env.options.horizon=9"]
+    for preset in ("strong", "paper", "none"):
+        env = config.load(None, [f"preset={preset}", *settings]).env
+        assert (env.options, env.label) == ({"horizon": 9}, "pursuit")
+    assert config.load(None, ["env=smac"]).env.options == config.load().env.options != {}
+
+
 @pytest.mark.parametrize("preset", ["strong", "paper"])
 def test_methods_bring_their_settings_and_leave_the_reward_to_the_preset(preset: str) -> None:
     coma, qmix, iac, central_v = (

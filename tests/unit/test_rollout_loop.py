@@ -70,8 +70,17 @@ class Leaving(Pursuit):
 class Stateless(BaseParallelWrapper[str, Any, Any]):
     """A game without a state of its own, in a wrapper."""
 
+    state_space = None
+
     def state(self) -> Any:
         raise NotImplementedError
+
+
+class MaskedInInfo(Pursuit):
+    """The same mask in the info, where PettingZoo games with plain observations have it."""
+
+    def _inform(self) -> Any:
+        return {agent: {**info, "action_mask": Masked.mask} for agent, info in super()._inform().items()}
 
 
 class Selfish(Pursuit):
@@ -169,8 +178,9 @@ def test_shapes_and_dtypes_are_the_declared_ones() -> None:
     assert (played.episode_id, played.policy_version) == (0, 3)
 
 
-def test_action_mask_is_obeyed() -> None:
-    played = play(Masked())
+@pytest.mark.parametrize("game", [Masked(), MaskedInInfo()])
+def test_action_mask_is_obeyed(game: Any) -> None:
+    played = play(game)
     assert (played.mask == np.array([False, True, True])).all()
     assert (played.actions > 0).all()
 

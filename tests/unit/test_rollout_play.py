@@ -65,6 +65,14 @@ def test_a_factory_that_cannot_be_used_is_explained(factory: str, message: str) 
         make_player(pettingzoo(factory))
 
 
+def test_options_that_a_factory_does_not_take_are_explained() -> None:
+    env = PURSUIT.model_copy(update={"options": {"horizont": 9}})
+    with pytest.raises(
+        ConfigError, match=r"not work with env.options .*unexpected keyword argument 'horizont'"
+    ):
+        env_spec(env)
+
+
 def test_an_unknown_map_is_refused() -> None:
     with pytest.raises(ValueError, match="3m"):
         make_player(EnvConfig(map="3n"))

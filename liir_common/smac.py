@@ -1,0 +1,158 @@
+"""StarCraft II itself as a PettingZoo ParallelEnv, through SMAC v1's own package.
+
+Source of the methods called here: Samvelyan et al., "The StarCraft Multi-Agent Challenge", 2019, and
+its code, SMAC v1. The package and the game are no requirements of this project.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from gymnasium.spaces import Box, Dict
+from pettingzoo import ParallelEnv
+
+from liir_common.battle.spaces import (
+    INFO_KEYS,
+    AvailableActions,
+    Observation,
+    joint_action,
+    masked_observations,
+)
+from liir_common.errors import ConfigError
+from liir_common.types import FloatArray
+
+
+class SmacEnv(ParallelEnv[str, Observation, np.int64]):
+    """A map of SMAC v1, from outside the same as `BattleEnv` of that map.
+
+    The game starts with the first reset and goes on from battle to battle. It takes a seed when it
+    starts, from SMAC's option `seed`, and none for a single battle.
+    """
+
+    metadata: dict[str, Any] = {  # noqa: RUF012  # PettingZoo declares it so
+        "name": "smac_v1",
+        "render_modes": [],
+        "is_parallelizable": True,
+    }
+    info_keys = INFO_KEYS
+
+    def __init__(self, map_name: str, **options: Any) -> None:
+        self._game = _start(map_name, options)
+        sizes = self._game.get_env_info()
+        n, n_actions, obs_dim = sizes["n_agents"], sizes["n_actions"], sizes["obs_shape"]
+        self.episode_limit = int(sizes["episode_limit"])
+        self.possible_agents = [f"ally_{i}" for i in range(n)]
+        self.agents: list[str] = []
+        self._obs = np.zeros((n, obs_dim), np.float32)
+        self._masks = np.zeros((n, n_actions), np.int8)
+        self._action_spaces = {
+            a: AvailableActions(mask) for a, mask in zip(self.possible_agents, self._masks, strict=True)
+        }
+        self._observation_spaces = dict.fromkeys(
+            self.possible_agents, masked_observations(obs_dim, n_actions)
+        )
+        self.state_space = Box(-np.inf, np.inf, (sizes["state_shape"],), np.float32)
+
+    def observation_space(self, agent: str) -> Dict:
+        """The observation in [-1, 1] and the action mask of one agent."""
+        return self._observation_spaces[agent]
+
+    def action_space(self, agent: str) -> AvailableActions:
+        """SMAC's actions: no-op, stop, north, south, east, west, then one per enemy."""
+        return self._action_spaces[agent]
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Observation], dict[str, dict[str, Any]]]:
+        """Start a battle; seed and options are part of PettingZoo's signature, SMAC has neither here."""
+        self._game.reset()
+        self.agents = list(self.possible_agents)
+        self._observe()
+        return self._observations(), self._infos({})
+
+    def step(
+        self, actions: dict[str, Any]
+    ) -> tuple[
+        dict[str, Observation], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]
+    ]:
+        """Play one step.
+
+        Raises:
+            RuntimeError: no battle is running, or StarCraft II broke down in this one.
+            ValueError: an agent's action is missing or not available.
+        """
+        if not self.agents:
+            raise RuntimeError("no battle is running; call reset() before step()")
+        reward, ended, outcome = self._game.step(joint_action(actions, self._action_spaces))
+        if "battle_won" not in outcome:
+            self.agents = []
+            raise RuntimeError("StarCraft II broke down and SMAC started it again; this battle is lost")
+        self._observe()
+        # Only `continuing_episode` makes SMAC say so.
+        at_limit = bool(outcome.get("episode_limit", False))
+        results = (
+            self._observations(),
+            dict.fromkeys(self.agents, float(reward)),
+            dict.fromkeys(self.agents, bool(ended) and not at_limit),
+            dict.fromkeys(self.agents, at_limit),
+            self._infos(_figures(outcome) if ended else {}),
+        )
+        if ended:
+            self.agents = []
+        return results
+
+    def state(self) -> FloatArray:
+        """SMAC's global state [S]."""
+        return np.asarray(self._game.get_state(), np.float32)
+
+    def close(self) -> None:
+        """End the game."""
+        self._game.close()
+
+    def _observe(self) -> None:
+        self._obs[:] = self._game.get_obs()
+        self._masks[:] = self._game.get_avail_actions()
+
+    def _observations(self) -> dict[str, Observation]:
+        return {
+            agent: {"observation": obs.copy(), "action_mask": mask.copy()}
+            for agent, obs, mask in zip(self.agents, self._obs, self._masks, strict=True)
+        }
+
+    def _infos(self, figures: dict[str, float]) -> dict[str, dict[str, Any]]:
+        return {
+            agent: {
+                "alive": bool(self._game.get_unit_by_id(i).health > 0),
+                "action_mask": mask.copy(),
+                **figures,
+            }
+            for i, (agent, mask) in enumerate(zip(self.agents, self._masks, strict=True))
+        }
+
+
+def _figures(outcome: dict[str, Any]) -> dict[str, float]:
+    """`INFO_KEYS` from the last info of SMAC."""
+    return {
+        "won": float(outcome["battle_won"]),
+        "dead_allies": float(outcome["dead_allies"]),
+        "dead_enemies": float(outcome["dead_enemies"]),
+    }
+
+
+def _start(map_name: str, options: dict[str, Any]) -> Any:
+    """SMAC's own environment, which tells its sizes before the game runs."""
+    try:
+        from smac.env import StarCraft2Env
+    # protobuf raises a TypeError when it meets StarCraft's older generated code.
+    except (ImportError, TypeError) as error:
+        raise ConfigError(
+            "env.kind smac wants StarCraft II and the package smac of github.com/oxwhirl/smac, not the "
+            f"optimiser of that name; docs/environments.md says how to install them. Importing it: {error}"
+        ) from error
+    try:
+        return StarCraft2Env(map_name=map_name, continuing_episode=True, **options)
+    except (KeyError, TypeError) as error:
+        raise ConfigError(
+            f"SMAC's StarCraft2Env refuses env.map {map_name!r} with env.options {options}: {error!r}"
+        ) from error

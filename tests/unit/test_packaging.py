@@ -1,0 +1,99 @@
+"""What an installation holds and needs: the battle alone wants only the base dependencies."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+import zipfile
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+# The first argument names what must not be imported.
+BLOCKED = """
+import sys
+from importlib.abc import MetaPathFinder
+
+class Blocked(MetaPathFinder):
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in sys.argv[1].split(","):
+            raise ModuleNotFoundError(f"{name} is no base dependency", name=name)
+
+sys.meta_path.insert(0, Blocked())
+"""
+PLAY = """
+from liir_common.battle.env import parallel_env
+env = parallel_env("3m", render_mode="ansi")
+env.reset(seed=1)
+env.step(dict.fromkeys(env.agents, 1))
+print(env.render())
+"""
+
+
+def needed(names: list[str]) -> set[str]:
+    """The distributions that come with those of `names`, themselves included."""
+    found: set[str] = set()
+    while names:
+        name = re.split(r"[^\w.-]", names.pop())[0].lower().replace("_", "-")
+        if name not in found:
+            found.add(name)
+            names += [r for r in metadata.requires(name) or () if "extra ==" not in r]
+    return found
+
+
+def all_but_base_dependencies() -> set[str]:
+    """Top-level modules of everything installed that a plain `pip install` of the project would not bring."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    base = needed(list(project["dependencies"])) | {project["name"]}
+    return {
+        module
+        for module, distributions in metadata.packages_distributions().items()
+        if not base & {name.lower().replace("_", "-") for name in distributions}
+    }
+
+
+def run(code: str, blocked: set[str], path: Path) -> str:
+    done = subprocess.run(
+        [sys.executable, "-c", BLOCKED + code, ",".join(blocked)],
+        capture_output=True,
+        text=True,
+        cwd=path,
+        env=os.environ | {"PYTHONPATH": str(path)},
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_the_battle_needs_the_base_dependencies_alone() -> None:
+    blocked = all_but_base_dependencies()
+    assert blocked >= {"torch", "ray", "grpc", "pydantic", "typer", "yaml", "PIL", "google"}
+    assert "enemy 2" in run(PLAY, blocked, ROOT)
+    with pytest.raises(AssertionError, match="yaml is no base dependency"):
+        run("import liir_common.config", blocked, ROOT)
+
+
+def test_the_wheel_holds_the_whole_package(tmp_path: Path) -> None:
+    source, site = tmp_path / "source", tmp_path / "site"
+    for name in ("liir_common", "services"):
+        shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, source)
+    pip = [sys.executable, "-m", "pip", "wheel", "--no-deps", "--no-build-isolation", "--no-index"]
+    subprocess.run([*pip, str(source), "-w", str(tmp_path)], check=True, capture_output=True)
+    (wheel,) = tmp_path.glob("*.whl")
+    zipfile.ZipFile(wheel).extractall(site)
+    for package in ("liir_common", "services"):
+        wanted = {p.relative_to(ROOT) for p in (ROOT / package).rglob("*") if p.is_file()}
+        wanted = {p for p in wanted if "__pycache__" not in p.parts}
+        assert wanted == {p.relative_to(site) for p in (site / package).rglob("*") if p.is_file()}
+    code = "import liir_common.battle.env as env; print(env.__file__, env.battle_spec('3m').n_actions)"
+    imported, n_actions = run(code, all_but_base_dependencies(), site).split()
+    assert Path(imported).is_relative_to(site)
+    assert n_actions == "9"

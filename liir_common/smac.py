@@ -47,7 +47,7 @@ class SmacEnv(ParallelEnv[str, Observation, np.int64]):
         self._obs = np.zeros((n, obs_dim), np.float32)
         self._masks = np.zeros((n, n_actions), np.int8)
         self._action_spaces = {
-            a: AvailableActions(mask) for a, mask in zip(self.possible_agents, self._masks, strict=True)
+            a: AvailableActions(self._masks, i) for i, a in enumerate(self.possible_agents)
         }
         self._observation_spaces = dict.fromkeys(
             self.possible_agents, masked_observations(obs_dim, n_actions)

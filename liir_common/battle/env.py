@@ -91,7 +91,7 @@ class BattleEnv(ParallelEnv[str, Observation, np.int64]):
         self.possible_agents = [f"ally_{i}" for i in range(n)]
         self.agents: list[str] = []
         self._action_spaces = {
-            a: AvailableActions(self._masks[i]) for i, a in enumerate(self.possible_agents)
+            a: AvailableActions(self._masks, i) for i, a in enumerate(self.possible_agents)
         }
         self._observation_spaces = dict.fromkeys(
             self.possible_agents, masked_observations(self._buffers.obs.shape[1], n_actions)

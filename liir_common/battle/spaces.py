@@ -18,10 +18,16 @@ Observation = dict[str, Any]
 class AvailableActions(Discrete):
     """Discrete actions of which `sample` without a mask draws one that is available now."""
 
-    def __init__(self, available: NDArray[np.int8]) -> None:
-        super().__init__(len(available))
-        self.available = available
-        """[A], owned and kept up to date by the environment"""
+    def __init__(self, masks: NDArray[np.int8], row: int) -> None:
+        """`masks` [n, A] is the environment's, which keeps it up to date; this agent's is one row."""
+        super().__init__(masks.shape[1])
+        # Not a view of the row: a copy of the environment would tear it from the masks.
+        self._masks, self._row = masks, row
+
+    @property
+    def available(self) -> NDArray[np.int8]:
+        """[A], the mask of now."""
+        return self._masks[self._row]
 
     def sample(
         self, mask: NDArray[np.int8] | None = None, probability: NDArray[Any] | None = None

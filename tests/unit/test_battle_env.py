@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+import pickle
+from copy import deepcopy
 from typing import Any
 
 import numpy as np
 import pytest
+from gymnasium.utils.env_checker import data_equivalence
 from pettingzoo.test import parallel_api_test, parallel_seed_test, render_test
 from pettingzoo.utils.conversions import parallel_to_aec
 from typer.testing import CliRunner
@@ -52,6 +55,20 @@ def test_same_seed_and_actions_same_bytes(map_name: str) -> None:
     assert play_randomly(env, 7)[0] == first, "an episode depends on the one before"
     assert play_randomly(parallel_env(map_name), 7)[0] == first
     assert play_randomly(env, 8)[0] != first
+
+
+@pytest.mark.parametrize("copy", [deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def test_a_copy_plays_on_its_own(copy: Any) -> None:
+    env = parallel_env("2s3z")
+    env.reset(seed=1)
+    twin = copy(env)
+    assert play_randomly(twin, 7)[0] == play_randomly(env, 7)[0]
+    env.reset(seed=3)
+    twin = copy(env)
+    results = [e.step(dict.fromkeys(env.agents, 2)) for e in (env, twin)]
+    assert data_equivalence(*results)
+    env.step(dict.fromkeys(env.agents, 2))
+    assert twin.snapshot() != env.snapshot()
 
 
 def test_seeds_have_64_bits() -> None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
-
 from liir_common.battle.env import BattleEnv, battle_spec
 
 

@@ -53,7 +53,7 @@ def train(
     path = path or Path("runs") / _run_name(resolved.env.label, resolved.algorithm.name, resolved.seed)
     arguments = [] if config is None or resume else ["--config", str(config)]
     arguments += [part for setting in settings or () for part in ("--set", setting)]
-    launcher = Launcher(path, arguments, resume)
+    launcher = Launcher(path, arguments, resume, resolved.security)
     summary = launcher.run(resolved.evaluation.enabled)
     _print_summary(path, summary)
     if launcher.stop_signal:
@@ -109,41 +109,60 @@ def evaluator(context: typer.Context) -> None:
 
 
 @app.command()
-def status(learner: options.Learner) -> None:
+def status(
+    learner: options.Learner, config: options.ConfigFile = None, settings: options.Settings = None
+) -> None:
     """Say how far a run is, as JSON."""
     from google.protobuf.json_format import MessageToJson
 
-    from liir_common.client import TrainingClient
+    from liir_common.client import TrainingClient, refusals_explained
 
-    with TrainingClient(learner, timeout_s=10) as client:
+    security = options.load_security(config, settings)
+    with TrainingClient(learner, 10, security) as client, refusals_explained():
         print(MessageToJson(client.status()))
 
 
 @app.command()
-def stop(learner: options.Learner, reason: str = "asked on the command line") -> None:
+def stop(
+    learner: options.Learner,
+    reason: str = "asked on the command line",
+    config: options.ConfigFile = None,
+    settings: options.Settings = None,
+) -> None:
     """Ask a learner to finish its step, save and end."""
-    from liir_common.client import TrainingClient
+    from liir_common.client import TrainingClient, refusals_explained
+    from liir_common.rpc.tokens import Role
 
-    with TrainingClient(learner, timeout_s=10) as client:
+    security = options.load_security(config, settings)
+    with TrainingClient(learner, 10, security, Role.OPERATOR) as client, refusals_explained():
         client.stop(reason)
 
 
 @checkpoints.command("list")
-def list_checkpoints(learner: options.Learner) -> None:
+def list_checkpoints(
+    learner: options.Learner, config: options.ConfigFile = None, settings: options.Settings = None
+) -> None:
     """One line per checkpoint: episode, environment steps, policy version, size, SHA-256."""
-    from liir_common.client import CheckpointClient
+    from liir_common.client import CheckpointClient, refusals_explained
 
-    with CheckpointClient(learner, timeout_s=10) as client:
+    security = options.load_security(config, settings)
+    with CheckpointClient(learner, 10, security) as client, refusals_explained():
         for frozen in client.list():
             print(_line(frozen))
 
 
 @checkpoints.command("watch")
-def watch_checkpoints(learner: options.Learner, after: int = 0) -> None:
+def watch_checkpoints(
+    learner: options.Learner,
+    after: int = 0,
+    config: options.ConfigFile = None,
+    settings: options.Settings = None,
+) -> None:
     """The same lines as they come, until the run is complete."""
-    from liir_common.client import CheckpointClient
+    from liir_common.client import CheckpointClient, refusals_explained
 
-    with CheckpointClient(learner, timeout_s=10) as client:
+    security = options.load_security(config, settings)
+    with CheckpointClient(learner, 10, security) as client, refusals_explained():
         for frozen in client.watch(after):
             print(_line(frozen), flush=True)
 
@@ -153,12 +172,15 @@ def get_checkpoint(
     episode: int,
     learner: options.Learner,
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write into.")] = Path(),
+    config: options.ConfigFile = None,
+    settings: options.Settings = None,
 ) -> None:
     """Download a checkpoint: its weights (safetensors) and its manifest (JSON), checked."""
-    from liir_common.client import CheckpointClient
+    from liir_common.client import CheckpointClient, refusals_explained
     from liir_common.files import write_atomic
 
-    with CheckpointClient(learner, timeout_s=10) as client:
+    security = options.load_security(config, settings)
+    with CheckpointClient(learner, 10, security) as client, refusals_explained():
         manifest, data = client.download(episode)
     output.mkdir(parents=True, exist_ok=True)
     stem = output / f"checkpoint-{episode:09d}"
@@ -172,6 +194,22 @@ def _line(frozen: Any) -> str:
         f"{frozen.episode:>9} {frozen.env_steps:>10} {frozen.policy_version:>7} "
         f"{frozen.size_bytes:>8} {frozen.sha256}"
     )
+
+
+@app.command()
+def certs(
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write into.")] = Path("certs"),
+    hosts: Annotated[
+        list[str] | None, typer.Option("--host", help="Name or address of the learner beside localhost.")
+    ] = None,
+) -> None:
+    """Make a development CA, certificates and tokens; again, renew the certificates with the same CA."""
+    from liir_common.certs import make_certs
+
+    make_certs(output, hosts or ())
+    print(f"security: {{ca: {output}/ca.pem, client_ca: {output}/ca.pem, tokens: {output}/tokens,")
+    print(f"           cert: {output}/server.pem, key: {output}/server-key.pem}}")
+    print(f"# clients elsewhere: {output}/client.pem and -key.pem, and only their role's line of the tokens")
 
 
 @app.command()

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 import grpc
 import numpy as np
 from numpy.typing import NDArray
 
 from liir_common.checkpoint import Manifest, unpack
-from liir_common.config import Config, from_tree
-from liir_common.errors import LiirError, UnreachableError
+from liir_common.config import PLAINTEXT, Config, SecurityConfig, from_tree, merge, parse_settings
+from liir_common.errors import LiirError, RefusedError, UnreachableError
 from liir_common.rpc.channel import DEADLINE_S, connect
 from liir_common.rpc.gen.liir.v1 import (
     checkpoint_pb2,
@@ -19,23 +20,48 @@ from liir_common.rpc.gen.liir.v1 import (
     training_pb2,
     training_pb2_grpc,
 )
+from liir_common.rpc.tokens import Role
 
+AWAY = (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.DEADLINE_EXCEEDED)
+"""Codes that tell of the connection, not of the call: to try again may help."""
 _PAGE = 1000
 _DOWNLOAD_TRIES = 5
 _WATCH_S = 20.0
 """After that a stream is asked for anew, from where it was: no silence is taken for a wait for ever."""
 
 
+@contextmanager
+def refusals_explained() -> Iterator[None]:
+    """Turn a call's failure into an error that a person can act on.
+
+    Raises:
+        RefusedError: the learner refused the call, and would again.
+        UnreachableError: the connection broke.
+    """
+    try:
+        yield
+    except grpc.RpcError as error:
+        kind = UnreachableError if error.code() in AWAY else RefusedError
+        raise kind(f"{error.code().name}: {error.details()}") from None
+
+
 class CheckpointClient:
     """Lists, downloads and watches the checkpoints of one learner."""
 
-    def __init__(self, address: str, timeout_s: float = 30.0) -> None:
-        """Connect to the learner at HOST:PORT.
+    def __init__(
+        self,
+        address: str,
+        timeout_s: float = 30.0,
+        security: SecurityConfig = PLAINTEXT,
+        role: Role = Role.READER,
+    ) -> None:
+        """Connect to the learner at HOST:PORT, with the token of `role` if there is one.
 
         Raises:
+            ConfigError: a file of `security` cannot be used.
             UnreachableError: nobody answered within `timeout_s`.
         """
-        self._channel = connect(address, timeout_s)
+        self._channel = connect(address, timeout_s, security, role)
         self._stub = checkpoint_pb2_grpc.CheckpointServiceStub(self._channel)
 
     def __enter__(self) -> CheckpointClient:
@@ -71,7 +97,7 @@ class CheckpointClient:
             try:
                 manifest = self._download_rest(episode, data)
             except grpc.RpcError as error:
-                if error.code() not in (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.DEADLINE_EXCEEDED):
+                if error.code() not in AWAY:
                     raise LiirError(f"checkpoint {episode}: {error.details()}") from None
                 continue
             unpack(bytes(data), manifest.sha256)
@@ -129,13 +155,20 @@ class CheckpointClient:
 class TrainingClient:
     """Asks a learner about its run."""
 
-    def __init__(self, address: str, timeout_s: float = 30.0) -> None:
-        """Connect to the learner at HOST:PORT.
+    def __init__(
+        self,
+        address: str,
+        timeout_s: float = 30.0,
+        security: SecurityConfig = PLAINTEXT,
+        role: Role = Role.READER,
+    ) -> None:
+        """Connect to the learner at HOST:PORT, with the token of `role` if there is one.
 
         Raises:
+            ConfigError: a file of `security` cannot be used.
             UnreachableError: nobody answered within `timeout_s`.
         """
-        self._channel = connect(address, timeout_s)
+        self._channel = connect(address, timeout_s, security, role)
         self._stub = training_pb2_grpc.TrainingServiceStub(self._channel)
 
     def __enter__(self) -> TrainingClient:
@@ -149,7 +182,7 @@ class TrainingClient:
         self._channel.close()
 
     def config(self) -> Config:
-        """The run's resolved configuration."""
+        """The run's resolved configuration; `security` is each process's own and not part of it."""
         run = self._stub.GetRun(training_pb2.GetRunRequest(), timeout=DEADLINE_S)
         return from_tree(json.loads(run.config_json))
 
@@ -163,3 +196,17 @@ class TrainingClient:
     def stop(self, reason: str) -> None:
         """Ask the learner to end gracefully; it does so after the learner step under way."""
         self._stub.Stop(training_pb2.StopRequest(reason=reason), timeout=DEADLINE_S)
+
+
+def learners_config(address: str, settings: Sequence[str], security: SecurityConfig, role: Role) -> Config:
+    """What the learner at HOST:PORT plays, with the settings laid over it and this process's own security.
+
+    Raises:
+        ConfigError: a setting or a file of `security` cannot be used.
+        RefusedError: the learner does not let this process in.
+        UnreachableError: the learner did not answer.
+    """
+    with TrainingClient(address, security=security, role=role) as client, refusals_explained():
+        tree = client.config().tree()
+    own = parse_settings(settings) | {"security": security.model_dump()}
+    return from_tree(merge(tree, own))

@@ -9,10 +9,10 @@ from __future__ import annotations
 import difflib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic_settings import (
     BaseSettings,
     InitSettingsSource,
@@ -211,6 +211,39 @@ class EvaluationConfig(Section):
     metrics_port: int = Field(9103, ge=0, le=65535)
 
 
+def _absolute(path: str) -> str:
+    return str(Path(path).expanduser().absolute()) if path else ""
+
+
+FilePath = Annotated[str, AfterValidator(_absolute)]
+
+
+class SecurityConfig(Section):
+    """TLS and tokens of this process. It names files: no secret is ever part of a configuration."""
+
+    ca: FilePath = ""
+    """Client: CA certificates (PEM) that the learner's must come from; empty speaks plaintext."""
+    cert: FilePath = ""
+    """Own certificate (PEM, with its chain): the learner's, or what a client shows if asked."""
+    key: FilePath = ""
+    """Private key of the certificate (PEM)."""
+    client_ca: FilePath = ""
+    """Learner: CA certificates (PEM) that every client's must come from; empty asks for none."""
+    tokens: FilePath = ""
+    """Lines `ROLE TOKEN [EXPIRES]`; the variable LIIR_TOKENS may hold them instead."""
+
+    @model_validator(mode="after")
+    def _check_pairs(self) -> Self:
+        if bool(self.cert) != bool(self.key):
+            raise ValueError("cert and key belong together, only one of them is set")
+        if self.client_ca and not self.cert:
+            raise ValueError("client_ca asks clients for certificates, which takes a cert and key of its own")
+        return self
+
+
+PLAINTEXT = SecurityConfig()
+
+
 class Config(BaseSettings):
     """A whole run. Sources, strongest first: keyword arguments, LIIR_* environment, the file."""
 
@@ -227,6 +260,7 @@ class Config(BaseSettings):
     actors: ActorsConfig = ActorsConfig()
     learner: LearnerConfig = LearnerConfig()
     evaluation: EvaluationConfig = EvaluationConfig()
+    security: SecurityConfig = SecurityConfig()
 
     @model_validator(mode="before")
     @classmethod
@@ -259,6 +293,10 @@ class Config(BaseSettings):
     def tree(self) -> dict[str, Any]:
         """The complete configuration as plain values, under the names a YAML file uses."""
         return self.model_dump(mode="json", by_alias=True)
+
+    def shared_tree(self) -> dict[str, Any]:
+        """The same without `security`: what is told to others, whose files are elsewhere."""
+        return self.model_dump(mode="json", by_alias=True, exclude={"security"})
 
 
 _RMSPROP = {"name": "rmsprop", "lr": 5e-4, "alpha": 0.99, "eps": 1e-5, "clip": 10.0}
@@ -409,7 +447,9 @@ def _explain(error: ValidationError) -> str:
 def _explain_one(item: Any) -> str:
     path = ".".join(str(part) for part in item["loc"])
     if item["type"] != "extra_forbidden":
-        return f"{path}: {item['msg']}; got {item['input']!r}"
+        # Whoever writes a token where a file's name belongs should not find it in a log.
+        got = "" if item["loc"][:1] == ("security",) else f"; got {item['input']!r}"
+        return f"{path}: {item['msg']}{got}"
     known = _known_keys(item["loc"][:-1])
     close = difflib.get_close_matches(str(item["loc"][-1]), known, n=1)
     hint = f"did you mean {close[0]!r}?" if close else f"known here: {', '.join(sorted(known))}"

@@ -19,10 +19,12 @@ import structlog
 from rich.console import Console
 
 from liir_common.client import CheckpointClient, TrainingClient
+from liir_common.config import SecurityConfig
 from liir_common.display import Display, make_display
 from liir_common.errors import ConfigError, LiirError, RefusedError
 from liir_common.report import Summary, write_report
 from liir_common.rpc.gen.liir.v1 import checkpoint_pb2
+from liir_common.rpc.tokens import Role
 
 log = structlog.get_logger()
 
@@ -85,6 +87,12 @@ class Service:
         return True
 
 
+def _as_settings(security: SecurityConfig) -> list[str]:
+    """Arguments that give a process the same files; JSON strings are YAML."""
+    files = security.model_dump(exclude_defaults=True)
+    return [part for key, path in files.items() for part in ("--set", f"security.{key}={json.dumps(path)}")]
+
+
 def die_with_parent() -> None:
     """In a child on Linux: get SIGTERM when the launcher dies, however it dies."""
     if sys.platform == "linux":
@@ -94,9 +102,12 @@ def die_with_parent() -> None:
 class Launcher:
     """The whole service on one machine, from start to summary."""
 
-    def __init__(self, run_dir: Path, learner_arguments: Sequence[str], resume: bool) -> None:
+    def __init__(
+        self, run_dir: Path, learner_arguments: Sequence[str], resume: bool, security: SecurityConfig
+    ) -> None:
         """Prepare to run in `run_dir`; the arguments are those of `liir learner`."""
         self._run_dir = run_dir
+        self._security = security
         logs = run_dir / "logs"
         logs.mkdir(parents=True, exist_ok=True)
         arguments = ["--run-dir", str(run_dir), *learner_arguments]
@@ -140,7 +151,7 @@ class Launcher:
         if "--resume" not in self._learner.arguments:
             self._learner.arguments.append("--resume")
         for service in (self._actors, self._evaluator) if evaluate else (self._actors,):
-            service.arguments += ["--learner", address]
+            service.arguments += ["--learner", address, *_as_settings(self._security)]
             service.start()
         return address
 
@@ -160,7 +171,10 @@ class Launcher:
         display = make_display(f"LIIR · {self._run_dir}", console)
         shown: list[checkpoint_pb2.Evaluation] = []
         try:
-            with TrainingClient(address) as training, CheckpointClient(address) as checkpoints:
+            with (
+                TrainingClient(address, security=self._security, role=Role.OPERATOR) as training,
+                CheckpointClient(address, security=self._security, role=Role.OPERATOR) as checkpoints,
+            ):
                 while not self._stop_signal and self._learner.exit_code != 0:
                     self._revive()
                     self._show(display, training, checkpoints, shown)

@@ -4,6 +4,7 @@ import logging
 import sys
 
 import structlog
+from structlog.tracebacks import ExceptionDictTransformer
 
 
 def configure(process: str) -> None:
@@ -15,7 +16,8 @@ def configure(process: str) -> None:
             structlog.contextvars.merge_contextvars,
             structlog.processors.add_log_level,
             structlog.processors.TimeStamper(fmt="iso", utc=True),
-            structlog.processors.dict_tracebacks
+            # Without local variables: one of them may be a secret.
+            structlog.processors.ExceptionRenderer(ExceptionDictTransformer(show_locals=False))
             if not terminal
             else structlog.processors.ExceptionPrettyPrinter(),
             renderer,

@@ -8,7 +8,7 @@ import typer
 import yaml
 
 from liir_common import config
-from liir_common.config import Config
+from liir_common.config import Config, SecurityConfig
 from liir_common.errors import ConfigError
 
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="YAML file with the configuration.")]
@@ -27,6 +27,15 @@ def run(command: Callable[..., None]) -> None:
     app = typer.Typer(pretty_exceptions_enable=False, add_completion=False)
     app.command()(command)
     app()
+
+
+def load_security(file: Path | None, settings: list[str] | None) -> SecurityConfig:
+    """The section `security` of a client of a learner: from the file, the environment and the settings.
+
+    Raises:
+        ConfigError: the configuration cannot be used.
+    """
+    return config.load(file, settings or ()).security
 
 
 def load_run_config(

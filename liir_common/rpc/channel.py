@@ -5,8 +5,12 @@ import random
 from collections.abc import Iterator
 
 import grpc
+from grpc_health.v1 import health_pb2
 
+from liir_common.config import PLAINTEXT, SecurityConfig
 from liir_common.errors import UnreachableError
+from liir_common.rpc.security import channel_credentials
+from liir_common.rpc.tokens import Role
 
 MAX_MESSAGE_BYTES = 32 * 2**20
 """Largest message either side takes; a 27m_vs_30m episode has about 7 MiB."""
@@ -50,22 +54,55 @@ CHANNEL_OPTIONS = (
 )
 
 
-def connect(address: str, timeout_s: float = 30.0) -> grpc.Channel:
+def open_channel(address: str, security: SecurityConfig, role: Role) -> grpc.Channel:
+    """A channel to the learner at HOST:PORT, answered or not, for calls in this role.
+
+    Raises:
+        ConfigError: a file of `security` cannot be used.
+    """
+    credentials = channel_credentials(security, role)
+    if credentials is None:
+        return grpc.insecure_channel(address, options=CHANNEL_OPTIONS)
+    return grpc.secure_channel(address, credentials, options=CHANNEL_OPTIONS)
+
+
+def connect(
+    address: str,
+    timeout_s: float = 30.0,
+    security: SecurityConfig = PLAINTEXT,
+    role: Role = Role.READER,
+) -> grpc.Channel:
     """A channel to the learner at HOST:PORT, once it answers.
 
     Raises:
-        UnreachableError: nobody answered within `timeout_s`.
+        ConfigError: a file of `security` cannot be used.
+        UnreachableError: nobody answered within `timeout_s`, or not with TLS as `security` has it.
     """
-    channel = grpc.insecure_channel(address, options=CHANNEL_OPTIONS)
+    channel = open_channel(address, security, role)
     try:
         grpc.channel_ready_future(channel).result(timeout=timeout_s)
     except grpc.FutureTimeoutError:
-        channel.close()
+        with channel:
+            reason = _why_not_ready(channel)
         raise UnreachableError(
-            f"no learner answered at {address} within {timeout_s:g} s; is it running, and is the port the "
-            "one in its run directory's endpoints.json?"
+            f"no learner answered at {address} within {timeout_s:g} s ({reason}); is it running, is the port "
+            "the one in its run directory's endpoints.json, and does security.ca here go with security.cert "
+            "there?"
         ) from None
     return channel
+
+
+def _why_not_ready(channel: grpc.Channel) -> str:
+    """What gRPC says about the connection; its state alone does not tell a closed port from a wrong CA."""
+    try:
+        check = channel.unary_unary(
+            "/grpc.health.v1.Health/Check",
+            request_serializer=health_pb2.HealthCheckRequest.SerializeToString,
+        )
+        check(health_pb2.HealthCheckRequest(), timeout=1.0)
+    except grpc.RpcError as error:
+        return str(error.details())
+    return "it answered too late"
 
 
 def backoffs(first_s: float = 0.1, most_s: float = 5.0) -> Iterator[float]:

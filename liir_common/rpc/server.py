@@ -10,9 +10,13 @@ from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
 from liir_common import metrics
+from liir_common.config import SecurityConfig
 from liir_common.errors import ConfigError
 from liir_common.rpc import channel
 from liir_common.rpc.gen.liir.v1 import checkpoint_pb2, rollout_pb2, training_pb2
+from liir_common.rpc.refused import Refused
+from liir_common.rpc.security import AuthInterceptor, server_credentials
+from liir_common.rpc.tokens import METHODS, PUBLIC, Tokens
 
 log = structlog.get_logger()
 
@@ -26,19 +30,13 @@ _OPTIONS = (
     # Two learners on one port would each get half of the actors.
     ("grpc.so_reuseport", 0),
 )
+_MAX_REASON = 1000
+"""Characters of an error message; it may quote what a peer sent."""
 _SERVICES = tuple(
     descriptor.full_name
     for module in (rollout_pb2, checkpoint_pb2, training_pb2)
     for descriptor in module.DESCRIPTOR.services_by_name.values()
 )
-
-
-class Refused(Exception):
-    """A request that cannot be served; ends the call with `code` and the message."""
-
-    def __init__(self, code: grpc.StatusCode, message: str) -> None:
-        super().__init__(message)
-        self.code = code
 
 
 class ErrorInterceptor(grpc.aio.ServerInterceptor):
@@ -90,28 +88,35 @@ def _guard_stream(inner: Callable[..., AsyncIterator[Any]], method: str) -> Call
 
 async def _abort(context: grpc.aio.ServicerContext, error: Exception, method: str) -> None:
     code = error.code if isinstance(error, Refused) else grpc.StatusCode.INVALID_ARGUMENT
-    metrics.RPC_ERRORS.labels(method=method, code=code.name).inc()
-    log.warning("refused a call", method=method, code=code.name, reason=str(error), peer=context.peer())
-    await context.abort(code, str(error))
+    # The caller chooses both: no label for every name made up, no status beyond what gRPC lets through.
+    known = method if method in METHODS or method in PUBLIC else "unknown"
+    reason = str(error)[:_MAX_REASON]
+    metrics.RPC_ERRORS.labels(method=known, code=code.name).inc()
+    log.warning("refused a call", method=known, code=code.name, reason=reason, peer=context.peer())
+    await context.abort(code, reason)
 
 
 class Server:
     """A gRPC server with health and reflection; `port` is the bound one."""
 
-    def __init__(self, host: str, port: int, insecure: bool) -> None:
+    def __init__(self, host: str, port: int, security: SecurityConfig, insecure: bool = False) -> None:
         """Bind at once, so that a busy port is known before anything else starts.
 
         Raises:
-            ConfigError: the port is taken, or the address is not loopback and plaintext was not asked for.
+            ConfigError: the port is taken, a file of `security` cannot be used, or other machines can reach
+                the address, TLS or tokens are missing, and `insecure` does not say that this is meant.
         """
-        if not insecure and not _is_loopback(host):
-            raise ConfigError(
-                f"learner.host is {host}, which other machines can reach, and this server speaks plaintext; "
-                "keep it on 127.0.0.1, or set learner.insecure=true on a network you trust"
-            )
-        self.grpc = grpc.aio.server(interceptors=(ErrorInterceptor(),), options=_OPTIONS)
+        credentials, tokens = server_credentials(security), Tokens(security.tokens)
+        _check_exposure(host, insecure, tls=credentials is not None, tokens=bool(tokens))
+        interceptors = (ErrorInterceptor(), *((AuthInterceptor(tokens),) if tokens else ()))
+        self.grpc = grpc.aio.server(interceptors=interceptors, options=_OPTIONS)
+        address = f"{host}:{port}"
         try:
-            self.port: int = self.grpc.add_insecure_port(f"{host}:{port}")
+            self.port: int = (
+                self.grpc.add_secure_port(address, credentials)
+                if credentials
+                else self.grpc.add_insecure_port(address)
+            )
         except RuntimeError:
             raise ConfigError(
                 f"cannot listen on {host}:{port}: the port is taken or the address is not this machine's; "
@@ -135,6 +140,22 @@ class Server:
     async def stop(self, grace_s: float) -> None:
         """End; streams still open after the grace are cut."""
         await self.grpc.stop(grace_s)
+
+
+def _check_exposure(host: str, insecure: bool, tls: bool, tokens: bool) -> None:
+    if tokens and not tls:
+        raise ConfigError("there are tokens, and no security.cert; a token never travels in plaintext")
+    if insecure or _is_loopback(host) or (tls and tokens):
+        return
+    missing = " and ".join(
+        what
+        for what, there in (("TLS (security.cert)", tls), ("tokens (security.tokens)", tokens))
+        if not there
+    )
+    raise ConfigError(
+        f"learner.host is {host}, which other machines can reach, without {missing}; `liir certs` makes both "
+        "for development; or keep to 127.0.0.1, or set learner.insecure=true on a network you trust"
+    )
 
 
 def _is_loopback(host: str) -> bool:

@@ -5,21 +5,23 @@ import sys
 
 import ray
 
-from liir_common import config, logs, metrics, options
-from liir_common.client import TrainingClient
+from liir_common import logs, metrics, options
+from liir_common.client import learners_config
 from liir_common.errors import exit_on_error
 from liir_common.rollout.play import warm_up
+from liir_common.rpc.tokens import Role
 from services.actor.driver import Fleet, start_ray
 
 
-def actors(learner: options.Learner, settings: options.Settings = None) -> None:
+def actors(
+    learner: options.Learner, config: options.ConfigFile = None, settings: options.Settings = None
+) -> None:
     """Play for a learner with N Ray actors; what to play comes from the learner."""
     logs.configure("actors")
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     with exit_on_error():
-        with TrainingClient(learner) as client:
-            tree = client.config().tree()
-        resolved = config.from_tree(config.merge(tree, config.parse_settings(settings or ())))
+        security = options.load_security(config, settings)
+        resolved = learners_config(learner, settings or (), security, Role.ACTOR)
         metrics.serve(resolved.actors.metrics_port, "actors.metrics_port")
         # Compiled once here; every actor finds the result in the cache.
         warm_up(resolved.env)

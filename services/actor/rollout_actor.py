@@ -17,6 +17,7 @@ from liir_common.rollout.play import make_player
 from liir_common.rollout.player import Player
 from liir_common.rpc import channel, codec
 from liir_common.rpc.gen.liir.v1 import rollout_pb2, rollout_pb2_grpc
+from liir_common.rpc.tokens import Role
 
 log = structlog.get_logger()
 
@@ -32,6 +33,7 @@ class RolloutActor:
         self._hello = (name, incarnation)
         self._address = address
         config: Config = from_tree(config_tree)
+        self._security = config.security
         self._compress = config.actors.compress
         self._player: Player = make_player(config.env, config.algorithm.policy_hidden)
         self._shapes = types.policy_shapes(self._player.spec, config.algorithm.policy_hidden)
@@ -43,10 +45,11 @@ class RolloutActor:
         """Play until the learner says that the run is complete.
 
         Raises:
+            ConfigError: a file of `security` cannot be used.
             RefusedError: the learner will not have this actor.
         """
         waits = channel.backoffs()
-        with grpc.insecure_channel(self._address, options=channel.CHANNEL_OPTIONS) as connection:
+        with channel.open_channel(self._address, self._security, Role.ACTOR) as connection:
             learner = rollout_pb2_grpc.RolloutServiceStub(connection)
             while True:
                 try:

@@ -9,17 +9,16 @@ import numpy as np
 import structlog
 
 from liir_common import checkpoint, metrics, seeds
-from liir_common.client import CheckpointClient
+from liir_common.client import AWAY, CheckpointClient
 from liir_common.config import Config
 from liir_common.errors import RefusedError, UnreachableError
 from liir_common.rollout.player import Player
 from liir_common.rpc.channel import backoffs
 from liir_common.rpc.gen.liir.v1 import checkpoint_pb2
+from liir_common.rpc.tokens import Role
 from liir_common.types import Exploration, Ticket, Weights
 
 log = structlog.get_logger()
-
-_AWAY = (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.DEADLINE_EXCEEDED)
 
 
 def evaluate(
@@ -65,13 +64,14 @@ class Evaluator:
             RefusedError: the learner refused a call; to try again would not help.
         """
         waits = backoffs()
-        with CheckpointClient(self._address) as client:  # which connects again by itself
+        # The client connects again by itself.
+        with CheckpointClient(self._address, security=self._config.security, role=Role.EVALUATOR) as client:
             while True:
                 try:
                     self._catch_up(client)
                     return
                 except grpc.RpcError as error:
-                    if error.code() not in _AWAY:
+                    if error.code() not in AWAY:
                         raise RefusedError(f"{error.code().name}: {error.details()}") from None
                     log.warning("the learner is away", address=self._address, reason=error.details())
                 except UnreachableError as error:

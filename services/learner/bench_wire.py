@@ -42,7 +42,7 @@ async def _measure(settings: config.Config, streams: int, batches: int, repeats:
     spec = env_spec(settings.env)
     delivered: queue.SimpleQueue[list[Trajectory] | None] = queue.SimpleQueue()
     service = RolloutService(settings, spec, 0, delivered)
-    server = Server("127.0.0.1", 0, insecure=False)
+    server = Server("127.0.0.1", 0, settings.security)
     rollout_pb2_grpc.add_RolloutServiceServicer_to_server(service, server.grpc)
     await server.start()
     weights = random_weights(spec, settings.algorithm.policy_hidden, seed=0)

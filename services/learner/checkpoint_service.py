@@ -12,7 +12,7 @@ from liir_common import metrics
 from liir_common.checkpoint import Manifest
 from liir_common.errors import CorruptError
 from liir_common.rpc.gen.liir.v1 import checkpoint_pb2, checkpoint_pb2_grpc
-from liir_common.rpc.server import Refused
+from liir_common.rpc.refused import Refused
 from services.learner.run_directory import RunDirectory
 
 _CHUNK_BYTES = 64 * 1024

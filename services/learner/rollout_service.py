@@ -15,7 +15,7 @@ from liir_common.build import build
 from liir_common.config import Config
 from liir_common.rpc import codec
 from liir_common.rpc.gen.liir.v1 import rollout_pb2, rollout_pb2_grpc
-from liir_common.rpc.server import Refused
+from liir_common.rpc.refused import Refused
 from liir_common.types import EnvSpec, Weights
 from services.learner.intake import Intake, Opening
 from services.learner.trainer import Batches

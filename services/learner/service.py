@@ -40,7 +40,9 @@ async def serve(config: Config, run: RunDirectory, spec: EnvSpec) -> None:
     # the trainer's to sleep at every barrier, which doubles the time of an update.
     set_up_process(threads=1)
     loop = asyncio.get_running_loop()
-    server = Server(config.learner.host, config.learner.port, config.learner.insecure)
+    server = Server(
+        config.learner.host, config.learner.port, config.security, insecure=config.learner.insecure
+    )
     metrics_port = metrics.serve(config.learner.metrics_port, "learner.metrics_port")
     algorithm = make_algorithm(
         spec, config.algorithm, seeds.derive(config.seed, seeds.LEARNER), device(config.learner.device)

@@ -182,7 +182,7 @@ class Trainer:
                 run_id=self.run_directory.run_id,
                 git_commit=git_commit(),
                 env_spec=asdict(self.run_directory.spec),
-                config=self.config.tree(),
+                config=self.config.shared_tree(),
                 created=time.time(),
                 sha256=hashlib.sha256(data).hexdigest(),
                 size_bytes=len(data),

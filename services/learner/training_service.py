@@ -39,7 +39,7 @@ class TrainingService(training_pb2_grpc.TrainingServiceServicer):
         """What never changes during a run."""
         return training_pb2.GetRunResponse(
             run_id=self._run.run_id,
-            config_json=json.dumps(self._run.config.tree()),
+            config_json=json.dumps(self._run.config.shared_tree()),
             env_spec_hash=self._run.spec.hash,
             build=build(),
         )

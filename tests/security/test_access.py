@@ -1,0 +1,310 @@
+"""Who may call what: a real TLS server on loopback, asked by every role for every method."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+import shutil
+import ssl
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import grpc
+import pytest
+from grpc_health.v1 import health_pb2
+from grpc_reflection.v1alpha import reflection_pb2
+
+from liir_common import config
+from liir_common.certs import make_certs
+from liir_common.client import CheckpointClient
+from liir_common.config import PLAINTEXT, SecurityConfig
+from liir_common.errors import ConfigError, UnreachableError
+from liir_common.rpc import channel, tokens
+from liir_common.rpc.gen.liir.v1 import (
+    checkpoint_pb2,
+    checkpoint_pb2_grpc,
+    rollout_pb2,
+    rollout_pb2_grpc,
+    training_pb2,
+    training_pb2_grpc,
+)
+from liir_common.rpc.server import Server
+from liir_common.rpc.tokens import Role
+
+DENIED, UNKNOWN = grpc.StatusCode.PERMISSION_DENIED, grpc.StatusCode.UNAUTHENTICATED
+REACHED = "Method not implemented!"
+"""What the generated servicers say when a call has come through; no test here needs more than that."""
+# Which of actor, evaluator, reader and operator may call a method.
+ACCESS = {
+    "/liir.v1.RolloutService/Play": "x--x",
+    "/liir.v1.CheckpointService/ListCheckpoints": "-xxx",
+    "/liir.v1.CheckpointService/GetCheckpoint": "-xxx",
+    "/liir.v1.CheckpointService/WatchCheckpoints": "-xxx",
+    "/liir.v1.CheckpointService/ListEvaluations": "-xxx",
+    "/liir.v1.CheckpointService/ReportEvaluation": "-x-x",
+    "/liir.v1.TrainingService/GetRun": "xxxx",
+    "/liir.v1.TrainingService/GetStatus": "--xx",
+    "/liir.v1.TrainingService/Stop": "---x",
+    "/liir.v1.TrainingService/NoSuchMethod": "----",
+    "/other.Service/Method": "----",
+}
+HEALTH = "/grpc.health.v1.Health/Check"
+
+
+def security(folder: Path, **files: str) -> SecurityConfig:
+    """The learner's section, as `liir certs` prints it, with other files if named."""
+    named = {"ca": "ca.pem", "client_ca": "ca.pem", "cert": "server.pem", "key": "server-key.pem"}
+    named |= {"tokens": "tokens"} | files
+    return SecurityConfig(**{key: str(folder / name) if name else "" for key, name in named.items()})
+
+
+@contextmanager
+def serving(settings: SecurityConfig) -> Iterator[str]:
+    """A server with all services, in a thread of its own; yields its address."""
+    started: dict[str, Any] = {}
+    ready = threading.Event()
+
+    async def serve() -> None:
+        server = Server("127.0.0.1", 0, settings)
+        rollout_pb2_grpc.add_RolloutServiceServicer_to_server(
+            rollout_pb2_grpc.RolloutServiceServicer(), server.grpc
+        )
+        checkpoint_pb2_grpc.add_CheckpointServiceServicer_to_server(
+            checkpoint_pb2_grpc.CheckpointServiceServicer(), server.grpc
+        )
+        training_pb2_grpc.add_TrainingServiceServicer_to_server(
+            training_pb2_grpc.TrainingServiceServicer(), server.grpc
+        )
+        await server.start()
+        ended = asyncio.Event()
+        started.update(port=server.port, end=ended.set, loop=asyncio.get_running_loop())
+        ready.set()
+        await ended.wait()
+        await server.stop(0)
+
+    thread = threading.Thread(target=asyncio.run, args=(serve(),))
+    thread.start()
+    assert ready.wait(10)
+    try:
+        yield f"127.0.0.1:{started['port']}"
+    finally:
+        started["loop"].call_soon_threadsafe(started["end"])
+        thread.join()
+
+
+@pytest.fixture(scope="module")
+def learner(certs: Path) -> Iterator[str]:
+    with serving(security(certs)) as address:
+        yield address
+
+
+def ask(address: str, method: str, settings: SecurityConfig, role: Role = Role.READER) -> tuple[Any, str]:
+    """Status code and details of a call with an empty request."""
+    with channel.connect(address, 10, settings, role) as connection:
+        return ask_over(connection, method)
+
+
+def ask_over(connection: grpc.Channel, method: str, metadata: Any = None) -> tuple[Any, str]:
+    try:
+        list(connection.stream_stream(method)(iter([b""]), timeout=10, metadata=metadata))
+    except grpc.RpcError as error:
+        return error.code(), error.details()
+    return grpc.StatusCode.OK, ""
+
+
+@pytest.mark.parametrize(("index", "role"), list(enumerate(Role)))
+def test_each_role_reaches_its_methods_and_no_other(
+    learner: str, certs: Path, index: int, role: Role
+) -> None:
+    with channel.connect(learner, 10, security(certs), role) as connection:
+        for method, access in ACCESS.items():
+            code, details = ask_over(connection, method)
+            if access[index] == "x":
+                assert REACHED in details, (method, code, details)
+            else:
+                assert code == DENIED, (method, code, details)
+                assert f"role {role} may not call this" in details
+        assert ask_over(connection, HEALTH)[0] == grpc.StatusCode.OK
+        reflected = connection.stream_stream(
+            "/grpc.reflection.v1alpha.ServerReflection/ServerReflectionInfo",
+            reflection_pb2.ServerReflectionRequest.SerializeToString,
+            reflection_pb2.ServerReflectionResponse.FromString,
+        )(iter([reflection_pb2.ServerReflectionRequest(list_services="")]), timeout=10)
+        assert len(next(reflected).list_services_response.service) == 5
+
+
+def test_every_method_that_is_served_has_its_line_in_the_table() -> None:
+    modules = (rollout_pb2, checkpoint_pb2, training_pb2, health_pb2, reflection_pb2)
+    services = [s for module in modules for s in module.DESCRIPTOR.services_by_name.values()]
+    served = {f"/{service.full_name}/{method.name}" for service in services for method in service.methods}
+    assert served == set(tokens.METHODS) | tokens.PUBLIC
+    assert not set(tokens.METHODS) & tokens.PUBLIC
+
+
+def test_without_a_token_only_health_answers(learner: str, certs: Path) -> None:
+    with channel.connect(learner, 10, security(certs, tokens="")) as connection:
+        for method in ACCESS:
+            code, details = ask_over(connection, method)
+            assert (code, "got none" in details) == (UNKNOWN, True), (method, code, details)
+        assert ask_over(connection, HEALTH)[0] == grpc.StatusCode.OK
+        for header in ("Bearer", "Bearer ", "Basic abc", f"Bearer {'x' * 43}", "Bearer " + "y" * 4000):
+            code, details = ask_over(connection, next(iter(ACCESS)), [("authorization", header)])
+            assert code == UNKNOWN, (header, details)
+            assert "xxx" not in details
+
+
+def test_an_expired_token_is_refused_with_its_date(tmp_path: Path, certs: Path) -> None:
+    folder = tmp_path / "certs"
+    shutil.copytree(certs, folder)
+    (folder / "tokens").write_text(
+        f"reader {'a' * 40} 2020-02-29\nactor {'b' * 40} 2999-01-01T10:00+02:00 # new\n"
+    )
+    status = "/liir.v1.TrainingService/GetStatus"
+    with serving(security(folder)) as address:
+        code, details = ask(address, status, security(folder))
+        assert (code, "reader, expired at 2020-02-29 00:00 UTC" in details) == (UNKNOWN, True)
+        assert REACHED in ask(address, "/liir.v1.TrainingService/GetRun", security(folder), Role.ACTOR)[1]
+
+
+def test_the_wrong_certificates_are_explained(learner: str, certs: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "certs"
+    shutil.copytree(certs, folder)
+    make_certs(folder / "other")
+    wrong = {
+        "another CA": ({"ca": "other/ca.pem"}, "CERTIFICATE_VERIFY_FAILED"),
+        "no client certificate": ({"cert": "", "key": "", "client_ca": ""}, "security.ca"),
+        "one of another CA": ({"cert": "other/client.pem", "key": "other/client-key.pem"}, "security.ca"),
+        "plaintext": (None, "security.ca"),
+    }
+    for case, (files, message) in wrong.items():
+        settings = PLAINTEXT if files is None else security(folder, **files)
+        with pytest.raises(UnreachableError) as caught:
+            channel.connect(learner, 2, settings)
+        assert message in str(caught.value), case
+    client = {"cert": "client.pem", "key": "client-key.pem"}
+    assert REACHED in ask(learner, "/liir.v1.TrainingService/GetStatus", security(folder, **client))[1]
+
+
+async def bind(host: str, settings: SecurityConfig, insecure: bool = False) -> None:
+    server = Server(host, 0, settings, insecure)
+    await server.stop(0)
+
+
+@pytest.mark.parametrize(
+    ("files", "missing"),
+    [
+        ({"tokens": ""}, "without tokens"),
+        ({"tokens": "", "cert": "", "key": "", "client_ca": ""}, "without TLS (security.cert) and tokens"),
+        ({"cert": "", "key": "", "client_ca": ""}, "no security.cert; a token never travels in plaintext"),
+    ],
+)
+@pytest.mark.parametrize("host", ["0.0.0.0", "[::]", "learner.example"])
+def test_off_loopback_both_are_needed(certs: Path, host: str, files: dict[str, str], missing: str) -> None:
+    with pytest.raises(ConfigError, match=re.escape(missing)):
+        asyncio.run(bind(host, security(certs, **files)))
+
+
+def test_off_loopback_with_both_or_when_told_so(certs: Path) -> None:
+    asyncio.run(bind("0.0.0.0", security(certs)))
+    asyncio.run(bind("0.0.0.0", PLAINTEXT, insecure=True))
+    asyncio.run(bind("127.0.0.1", PLAINTEXT))
+
+
+def test_a_client_never_sends_a_token_in_plaintext(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(tokens.VARIABLE, f"reader {'a' * 40}")
+    with pytest.raises(ConfigError, match=r"no security\.ca; a token never travels in plaintext"):
+        CheckpointClient("127.0.0.1:1")
+
+
+def test_tokens_may_come_from_the_environment(
+    learner: str, certs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(tokens.VARIABLE, (certs / "tokens").read_text())
+    settings = security(certs, tokens="")
+    assert REACHED in ask(learner, "/liir.v1.TrainingService/Stop", settings, Role.OPERATOR)[1]
+
+
+def test_tokens_rotate_without_a_restart(tmp_path: Path, certs: Path) -> None:
+    folder = tmp_path / "certs"
+    shutil.copytree(certs, folder)
+    file, method = folder / "tokens", "/liir.v1.TrainingService/GetStatus"
+    (folder / "client").write_text(file.read_text())
+    with (
+        serving(security(folder)) as address,
+        channel.connect(address, 10, security(folder, tokens="client")) as connection,
+    ):
+        assert REACHED in ask_over(connection, method)[1]
+        replace(file, f"reader {'n' * 40}\n")
+        assert ask_over(connection, method)[0] == UNKNOWN
+        replace(folder / "client", f"reader {'n' * 40}\n")
+        assert REACHED in ask_over(connection, method)[1]
+        replace(file, "nonsense\n")
+        assert REACHED in ask_over(connection, method)[1]
+
+
+def replace(file: Path, text: str) -> None:
+    new = file.with_suffix(".new")
+    new.write_text(text)
+    new.replace(file)
+
+
+def test_certificates_rotate_without_a_restart(tmp_path: Path, certs: Path) -> None:
+    folder = tmp_path / "certs"
+    shutil.copytree(certs, folder)
+    with serving(security(folder, client_ca="")) as address:
+        host, port = address.split(":")
+        before = ssl.get_server_certificate((host, int(port)))
+        assert before.strip() == (certs / "server.pem").read_text().strip()
+        make_certs(folder)
+        assert (folder / "ca.pem").read_text() == (certs / "ca.pem").read_text()
+        assert (folder / "tokens").read_text() == (certs / "tokens").read_text()
+        after = ssl.get_server_certificate((host, int(port)))
+        assert after.strip() == (folder / "server.pem").read_text().strip() != before.strip()
+        (folder / "server.pem").unlink()
+        assert ssl.get_server_certificate((host, int(port))) == after
+
+
+def test_private_files_are_private(certs: Path) -> None:
+    for file in certs.iterdir():
+        private = file.name == "tokens" or file.name.endswith("-key.pem")
+        assert file.stat().st_mode & 0o777 == (0o600 if private else 0o644), file
+
+
+@pytest.mark.parametrize("name", ["cert", "key", "client_ca", "tokens"])
+def test_a_missing_file_is_named(certs: Path, name: str) -> None:
+    with pytest.raises(ConfigError, match=rf"security\.{name}, .*missing: No such file"):
+        asyncio.run(bind("127.0.0.1", security(certs, **{name: "missing"})))
+    with pytest.raises(ConfigError, match=r"security\.ca, .*missing: No such file"):
+        channel.connect("127.0.0.1:1", 1, security(certs, ca="missing"))
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["king SECRET", "reader", "reader short", "reader SECRET tomorrow", "reader SECRET 2027-01-01 more"],
+)
+def test_a_bad_line_is_named_and_not_quoted(line: str) -> None:
+    secret = "s" * 40
+    with pytest.raises(ConfigError) as caught:
+        tokens.parse(f"# comment\n\n{line.replace('SECRET', secret)}\n", "tokens")
+    assert "tokens, line 3" in str(caught.value)
+    assert secret not in str(caught.value)
+
+
+def test_no_secret_shows_in_a_repr_or_a_configuration_error(certs: Path) -> None:
+    secret = "s" * 40
+    (token,) = tokens.parse(f"reader {secret}", "tokens")
+    assert secret not in repr(token)
+    for setting in (f"security.tokens=[{secret}]", f"security={secret}", f"security.token={secret}"):
+        with pytest.raises(ConfigError) as caught:
+            config.load(None, [setting])
+        assert secret not in str(caught.value)
+
+
+def test_half_a_pair_is_a_mistake() -> None:
+    with pytest.raises(ConfigError, match="cert and key belong together"):
+        config.load(None, ["security.cert=a"])
+    with pytest.raises(ConfigError, match="takes a cert and key of its own"):
+        config.load(None, ["security.client_ca=a"])

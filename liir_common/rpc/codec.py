@@ -21,6 +21,7 @@ _DTYPES = {
     tensor_pb2.DTYPE_BOOL: np.dtype("?"),
     tensor_pb2.DTYPE_INT16: np.dtype("<i2"),
 }
+_DIMS_SHOWN = 8
 _DTYPE_CODES = {dtype: code for code, dtype in _DTYPES.items()}
 _EXPLORATIONS = {
     Exploration.SOFTMAX_FLOOR: rollout_pb2.EXPLORATION_SOFTMAX_FLOOR,
@@ -44,10 +45,10 @@ def decode_tensor(
 ) -> Array:
     """Read-only array of exactly the wanted dtype and shape, sharing the message's bytes if it can."""
     got = _DTYPES.get(message.dtype)
-    if got != dtype or tuple(message.shape) != shape:
+    if got != dtype or message.shape != list(shape):
         raise ValueError(
             f"{name}: wanted {dtype.name} {list(shape)}, "
-            f"got {got.name if got else 'an unknown dtype'} {list(message.shape)}"
+            f"got {got.name if got else 'an unknown dtype'} {_dims(message)}"
         )
     size = dtype.itemsize * math.prod(shape)
     data = _unpack(message.data, name, size) if message.zstd else message.data
@@ -56,6 +57,12 @@ def decode_tensor(
     if dtype == np.bool_ and data.translate(None, b"\0\1"):
         raise ValueError(f"{name}: wanted booleans as bytes 0 or 1, got other bytes")
     return np.frombuffer(data, dtype).reshape(shape)
+
+
+def _dims(message: tensor_pb2.Tensor) -> str:
+    """The shape as text; only the beginning of one that has millions of dimensions."""
+    shown = ", ".join(map(str, message.shape[:_DIMS_SHOWN]))
+    return f"[{shown}, …]" if len(message.shape) > _DIMS_SHOWN else f"[{shown}]"
 
 
 def _unpack(data: bytes, name: str, size: int) -> bytes:
@@ -130,7 +137,7 @@ def decode_trajectory(message: rollout_pb2.Trajectory, spec: EnvSpec) -> Traject
     length = message.reward.shape[0] if len(message.reward.shape) == 1 else 0
     if not 1 <= length <= spec.episode_limit:
         raise ValueError(
-            f"reward: wanted shape [T] with T in 1..{spec.episode_limit}, got {list(message.reward.shape)}"
+            f"reward: wanted shape [T] with T in 1..{spec.episode_limit}, got {_dims(message.reward)}"
         )
     if len(message.info) != len(spec.info_keys):
         raise ValueError(f"info: wanted {len(spec.info_keys)} figures, got {len(message.info)}")

@@ -6,6 +6,7 @@ from typing import Any
 
 import grpc
 import structlog
+from google.protobuf.message import DecodeError
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
@@ -58,11 +59,27 @@ class ErrorInterceptor(grpc.aio.ServerInterceptor):
             (True, True): ("stream_stream", grpc.stream_stream_rpc_method_handler, _guard_stream),
         }
         attribute, make, guard = kinds[handler.request_streaming, handler.response_streaming]
+        inner = getattr(handler, attribute)
+        decode = _decode_stream if handler.request_streaming else _decode
+        # gRPC itself would answer bytes that are no message with UNKNOWN and the name of a Python class.
         return make(
-            guard(getattr(handler, attribute), details.method),
-            request_deserializer=handler.request_deserializer,
+            guard(lambda request, context: inner(decode(request, handler), context), details.method),
             response_serializer=handler.response_serializer,
         )
+
+
+def _decode(request: bytes, handler: Any) -> Any:
+    if handler.request_deserializer is None:
+        return request
+    try:
+        return handler.request_deserializer(request)
+    except DecodeError:
+        raise ValueError(f"wanted a message of this method, got {len(request)} bytes that are none") from None
+
+
+async def _decode_stream(requests: AsyncIterator[bytes], handler: Any) -> AsyncIterator[Any]:
+    async for request in requests:
+        yield _decode(request, handler)
 
 
 def _guard_unary(inner: Callable[..., Awaitable[Any]], method: str) -> Callable[..., Awaitable[Any]]:
@@ -97,7 +114,7 @@ async def _abort(context: grpc.aio.ServicerContext, error: Exception, method: st
 
 
 class Server:
-    """A gRPC server with health and reflection; `port` is the bound one."""
+    """A gRPC server with health and reflection; `local_address` is where this machine reaches it."""
 
     def __init__(self, host: str, port: int, security: SecurityConfig, insecure: bool = False) -> None:
         """Bind at once, so that a busy port is known before anything else starts.
@@ -122,6 +139,8 @@ class Server:
                 f"cannot listen on {host}:{port}: the port is taken or the address is not this machine's; "
                 "choose another with --set learner.port=N (0 takes a free one)"
             ) from None
+        # Every interface is no address to call; from this machine loopback is, and the certificate's.
+        self.local_address = f"{'127.0.0.1' if host == '0.0.0.0' else host}:{self.port}"
         self._health = health.aio.HealthServicer()
         health_pb2_grpc.add_HealthServicer_to_server(self._health, self.grpc)
         names = (*_SERVICES, health.SERVICE_NAME, reflection.SERVICE_NAME)

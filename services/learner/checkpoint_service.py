@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Mapping
+import math
+from collections.abc import AsyncIterator, Mapping, Sequence
 from typing import Any
 
 import grpc
@@ -102,7 +103,7 @@ class CheckpointService(checkpoint_pb2_grpc.CheckpointServiceServicer):
         """Store the test of a checkpoint, once."""
         evaluation = request.evaluation
         manifest = self._find(evaluation.episode)
-        _check(evaluation, manifest)
+        _check(evaluation, manifest, self._run.spec.info_keys)
         if evaluation.episode in self.evaluations:
             return checkpoint_pb2.ReportEvaluationResponse(duplicate=True)
         self._run.evaluations.append(_to_row(evaluation, manifest, self._run.created))
@@ -152,13 +153,20 @@ def _to_message(manifest: Manifest) -> checkpoint_pb2.Checkpoint:
     )
 
 
-def _check(evaluation: checkpoint_pb2.Evaluation, manifest: Manifest) -> None:
+def _check(evaluation: checkpoint_pb2.Evaluation, manifest: Manifest, info_keys: Sequence[str]) -> None:
     if evaluation.sha256 != manifest.sha256:
         raise ValueError(f"evaluation: wanted one of SHA-256 {manifest.sha256}, got {evaluation.sha256!r}")
     for name in ("greedy", "sampled"):
         stats = getattr(evaluation, name)
         if not 0 <= stats.wins <= stats.episodes or stats.episodes == 0:
             raise ValueError(f"{name}: wanted 0 <= wins <= episodes > 0, got {stats.wins}/{stats.episodes}")
+        # Each becomes a column of a table.
+        if not set(stats.info_means) <= set(info_keys):
+            raise ValueError(
+                f"{name}: wanted info of {sorted(info_keys)}, got {len(stats.info_means)} others"
+            )
+        if not all(map(math.isfinite, (stats.return_mean, stats.length_mean, *stats.info_means.values()))):
+            raise ValueError(f"{name}: wanted finite means, got NaN or infinity")
 
 
 def _to_row(evaluation: checkpoint_pb2.Evaluation, manifest: Manifest, begin: float) -> dict[str, Any]:

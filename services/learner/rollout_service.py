@@ -23,6 +23,7 @@ from services.learner.trainer import Batches
 log = structlog.get_logger()
 
 _MAX_READY = 1024
+_MAX_ACTOR_ID = 100
 _EXPIRY_CHECK_S = 1.0
 
 
@@ -113,6 +114,10 @@ class RolloutService(rollout_pb2_grpc.RolloutServiceServicer):
         if first is None or first.WhichOneof("body") != "hello":
             raise Refused(grpc.StatusCode.INVALID_ARGUMENT, "the first message of a stream must be hello")
         hello = first.hello
+        if len(hello.actor_id) > _MAX_ACTOR_ID:
+            raise ValueError(
+                f"actor_id: wanted at most {_MAX_ACTOR_ID} characters, got {len(hello.actor_id)}"
+            )
         wanted = {"environment": self._spec.hash, "build": build()}
         got = {"environment": hello.env_spec_hash, "build": hello.build}
         if wanted != got:

@@ -74,9 +74,7 @@ async def serve(config: Config, run: RunDirectory, spec: EnvSpec) -> None:
         loop.add_signal_handler(signum, stop, signum.name)
 
     await server.start()
-    run.write_endpoints(
-        {"address": f"{config.learner.host}:{server.port}", "metrics": f"127.0.0.1:{metrics_port}"}
-    )
+    run.write_endpoints({"address": server.local_address, "metrics": f"127.0.0.1:{metrics_port}"})
     log.info("serving", address=f"{config.learner.host}:{server.port}", run=str(run.path))
     expiry = asyncio.create_task(rollouts.expire_tickets())
     try:

@@ -31,6 +31,9 @@ browser: setup ## Install Chromium, which the tests of the replay page want
 	then apt-get update -qq && apt-get install -y -qq --no-install-recommends chromium; \
 	else $(BIN)/playwright install chromium; fi
 
+fuzz: setup ## Damaged messages, 100 000 into the codec and 5 000 into a learner
+	$(BIN)/python -m tests.security.fuzz_wire $(ARGS)
+
 lint: setup ## Check style, types, import rules and generated code
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -51,4 +54,4 @@ proto: setup ## Generate the gRPC code from proto/
 proto-check: proto
 	git diff --exit-code -- $(GEN)
 
-.PHONY: help setup train test browser lint proto proto-check
+.PHONY: help setup train test browser fuzz lint proto proto-check

@@ -1,0 +1,31 @@
+"""A short turn of `make fuzz`, and the bombs one by one."""
+
+import pytest
+
+from liir_common.rpc import codec
+from liir_common.rpc.gen.liir.v1 import rollout_pb2
+from tests.samples import SPEC
+from tests.security import fuzz_wire
+
+
+def test_the_codec_takes_damaged_messages() -> None:
+    outcomes = fuzz_wire.fuzz_codec(3000)
+    assert outcomes.total() == 3000
+    assert {"trajectory: no message", "trajectory: refused", "trajectory: decoded"} <= set(outcomes)
+
+
+def test_a_learner_takes_damaged_calls() -> None:
+    outcomes = fuzz_wire.fuzz_server(300)
+    assert outcomes.total() == 300
+    assert len({outcome.split(":")[0] for outcome in outcomes}) == len(fuzz_wire.CALLS) + 1
+
+
+@pytest.mark.parametrize("bomb", fuzz_wire.BOMBS)
+@pytest.mark.parametrize("name", ["obs", "mask", "actions", "reward"])
+def test_bombs_are_refused(bomb: bytes, name: str) -> None:
+    assert len(bomb) < 2**15
+    message: rollout_pb2.Trajectory = fuzz_wire.trajectory(SPEC, compress=True)
+    tensor = getattr(message, name)
+    tensor.data = bomb
+    with pytest.raises(ValueError, match=f"{name}: wanted a zstd frame of"):
+        codec.decode_trajectory(message, SPEC)

@@ -1,0 +1,92 @@
+"""Nothing in our sources turns data into code."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+SOURCES = [
+    path
+    for path in sorted(ROOT.rglob("*.py"))
+    if not any(part.startswith(".") for part in path.relative_to(ROOT).parts)
+]
+SERIALISERS = {"pickle", "cloudpickle", "dill", "joblib", "marshal", "shelve"}
+SAFE_LOADERS = {"SafeLoader", "CSafeLoader"}
+
+
+def dangers(source: str) -> Iterator[str]:
+    """What in a source could run what it reads, as text."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            names = [alias.name for alias in node.names] + [getattr(node, "module", None) or ""]
+            yield from (name for name in names if name.split(".")[0] in SERIALISERS)
+        elif isinstance(node, ast.Call):
+            yield from dangerous_call(node)
+
+
+def dangerous_call(node: ast.Call) -> Iterator[str]:
+    called = ast.unparse(node.func)
+    keywords = {keyword.arg: ast.unparse(keyword.value) for keyword in node.keywords}
+    arguments = {ast.unparse(argument).rpartition(".")[2] for argument in node.args}
+    if called in (
+        "eval",
+        "exec",
+        "os.system",
+        "os.popen",
+        "__import__",
+        "yaml.unsafe_load",
+        "yaml.full_load",
+    ):
+        yield called
+    if called == "torch.load" and keywords.get("weights_only") != "True":
+        yield called
+    if called == "yaml.load" and not SAFE_LOADERS & {
+        *arguments,
+        keywords.get("Loader", "").rpartition(".")[2],
+    }:
+        yield called
+    if keywords.get("shell", "False") != "False":
+        yield f"{called}(shell=…)"
+    if keywords.get("weights_only", "True") != "True" or keywords.get("allow_pickle", "False") != "False":
+        yield f"{called}(pickles)"
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_no_source_runs_what_it_reads(path: Path) -> None:
+    assert not list(dangers(path.read_text(encoding="utf-8")))
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "import pickle",
+        "from pickle import loads",
+        "import os, ray.cloudpickle, cloudpickle.x",
+        "eval(text)",
+        "torch.load(file)",
+        "torch.load(file, weights_only=False)",
+        "yaml.load(text)",
+        "yaml.load(text, Loader=yaml.FullLoader)",
+        "subprocess.run(command, shell=True)",
+        "numpy.load(file, allow_pickle=True)",
+    ],
+)
+def test_the_search_finds(source: str) -> None:
+    assert list(dangers(source))
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "model.eval()",
+        "yaml.load(text, yaml.SafeLoader)",
+        "torch.load(file, weights_only=True)",
+        "subprocess.run(command, shell=False)",
+    ],
+)
+def test_the_search_lets_pass(source: str) -> None:
+    assert not list(dangers(source))

@@ -121,7 +121,7 @@ class Tokens:
                 f"security.tokens, or set {VARIABLE}"
             )
         found = None
-        # All are compared, each in constant time: how long it takes tells nothing about any of them.
+        # All are compared, each in constant time: how long it takes tells nothing of what they hold.
         for token in self._current():
             if hmac.compare_digest(token.secret.encode(), secret.encode()):
                 found = token

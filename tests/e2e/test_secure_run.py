@@ -34,11 +34,15 @@ def test_a_secure_run_lets_in_by_role_and_leaves_no_secret(
     printed = service.finish(service.start("certs", "-o", str(certs)))
     config = tmp_path / "secure.yaml"
     config.write_text(f"learner: {{host: 0.0.0.0}}\n{printed}")
+    tokens = (certs / "tokens").read_text()
     for role in ("reader", "operator"):
-        (certs / role).write_text(re.search(f"{role} .*", (certs / "tokens").read_text())[0])
+        (certs / role).write_text(re.search(f"{role} .*", tokens)[0])
+    # At first the tokens are in the environment, after the restart in the file that the configuration names.
+    environment = ("security.tokens=''", "training.total_env_steps=1000000")
     outputs = [printed]
-    long = ("training.total_env_steps=1000000",)
-    with service.training(run_dir, *long, options=["--config", str(config)]) as process:
+    monkeypatch.setenv("LIIR_TOKENS", tokens)
+    with service.training(run_dir, *environment, options=["--config", str(config)]) as process:
+        monkeypatch.delenv("LIIR_TOKENS")
         service.wait_for(lambda: (run_dir / "evaluations.csv").exists(), "the first evaluation")
         address = service.endpoints(run_dir)["address"]
         client = {"cert": "client.pem", "key": "client-key.pem", "ca": "ca.pem", "tokens": "reader"}
@@ -61,7 +65,8 @@ def test_a_secure_run_lets_in_by_role_and_leaves_no_secret(
         outputs.append(service.finish(process))
     # The run keeps the names of the files, not what is in them.
     more = int(read_table(run_dir / "metrics.csv")[-1]["env_steps"]) + 1000
-    outputs.append(service.train(run_dir, f"training.total_env_steps={more}", options=["--resume"]))
+    file = (f"training.total_env_steps={more}", f"security.tokens={certs / 'tokens'}")
+    outputs.append(service.train(run_dir, *file, options=["--resume"]))
     assert json.loads((run_dir / "summary.json").read_text())["evaluations"] > 0
 
     written = [file for folder in (run_dir, ray_folder, tmp_path / "fetched") for file in files_of(folder)]

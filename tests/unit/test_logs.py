@@ -1,0 +1,25 @@
+"""What a log line holds, and what it must not."""
+
+import json
+import subprocess
+import sys
+
+PROGRAM = """
+import structlog
+from liir_common import logs
+
+logs.configure("test")
+secret = "".join(map(chr, range(65, 91)))
+try:
+    raise ValueError("wanted something else")
+except ValueError:
+    structlog.get_logger().exception("failed")
+"""
+
+
+def test_tracebacks_tell_what_happened_and_no_local_variable() -> None:
+    text = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True).stderr
+    line = json.loads(text)
+    assert (line["event"], line["process"]) == ("failed", "test")
+    assert line["exception"][0]["exc_value"] == "wanted something else"
+    assert "ABCDEFGHIJKLMNOPQRSTUVWXYZ" not in text

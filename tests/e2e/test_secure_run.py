@@ -58,6 +58,7 @@ def test_a_secure_run_lets_in_by_role_and_leaves_no_secret(
         assert " 20 " in liir("checkpoints", "list")
         liir("checkpoints", "get", "20", "-o", str(tmp_path / "fetched"))
         assert "may not call this; it takes operator" in liir("stop", code=5)
+        assert "PERMISSION_DENIED: a token of role reader" in liir("actors", code=5)
         assert "got none; name a file" in liir("status", code=5, tokens="")
         metrics = service.endpoints(run_dir)["metrics"]
         outputs.append(urllib.request.urlopen(f"http://{metrics}/metrics", timeout=5).read().decode())

@@ -267,6 +267,23 @@ def test_certificates_rotate_without_a_restart(tmp_path: Path, certs: Path) -> N
         assert ssl.get_server_certificate((host, int(port))) == after
 
 
+def test_client_cas_rotate_without_a_restart(tmp_path: Path, certs: Path) -> None:
+    folder, method = tmp_path / "certs", "/liir.v1.TrainingService/GetStatus"
+    shutil.copytree(certs, folder)
+    make_certs(folder / "other")
+    (folder / "clients.pem").write_text((folder / "other" / "ca.pem").read_text())
+    old = security(folder)
+    new = security(folder, cert="other/client.pem", key="other/client-key.pem")
+    with serving(security(folder, client_ca="clients.pem")) as address:
+        with pytest.raises(UnreachableError):
+            channel.connect(address, 1, old)
+        assert REACHED in ask(address, method, new)[1]
+        replace(folder / "clients.pem", (folder / "ca.pem").read_text())
+        assert REACHED in ask(address, method, old)[1]
+        with pytest.raises(UnreachableError):
+            channel.connect(address, 1, new)
+
+
 def test_private_files_are_private(certs: Path) -> None:
     for file in certs.iterdir():
         private = file.name == "tokens" or file.name.endswith("-key.pem")

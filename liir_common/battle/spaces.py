@@ -27,7 +27,8 @@ class AvailableActions(Discrete):
     @property
     def available(self) -> NDArray[np.int8]:
         """[A], the mask of now."""
-        return self._masks[self._row]
+        mask: NDArray[np.int8] = self._masks[self._row]
+        return mask
 
     def sample(
         self, mask: NDArray[np.int8] | None = None, probability: NDArray[Any] | None = None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import re
 import shutil
+import socket
 import ssl
 import threading
 from collections.abc import Iterator
@@ -17,7 +18,7 @@ import pytest
 from grpc_health.v1 import health_pb2
 from grpc_reflection.v1alpha import reflection_pb2
 
-from liir_common import config
+from liir_common import config, metrics
 from liir_common.certs import make_certs
 from liir_common.client import CheckpointClient
 from liir_common.config import PLAINTEXT, SecurityConfig
@@ -282,6 +283,13 @@ def test_client_cas_rotate_without_a_restart(tmp_path: Path, certs: Path) -> Non
         assert REACHED in ask(address, method, old)[1]
         with pytest.raises(UnreachableError):
             channel.connect(address, 1, new)
+
+
+def test_metrics_are_served_on_loopback_only() -> None:
+    port = metrics.serve(0, "learner.metrics_port")
+    socket.create_connection(("127.0.0.1", port), timeout=5).close()
+    with pytest.raises(ConnectionRefusedError):  # an address of this machine, too
+        socket.create_connection(("127.0.0.2", port), timeout=5)
 
 
 def test_private_files_are_private(certs: Path) -> None:

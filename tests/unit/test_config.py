@@ -89,6 +89,18 @@ def test_tree_round_trip_ignores_the_environment(monkeypatch: pytest.MonkeyPatch
     assert config.from_tree(resolved.tree()) == resolved
 
 
+def test_security_names_files_wherever_it_is_set_and_is_not_shared(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("LIIR_SECURITY__CA", "ca.pem")
+    resolved = config.load(None, ["security.tokens=sub/tokens"])
+    assert resolved.security.ca == str(tmp_path / "ca.pem")
+    assert resolved.security.tokens == str(tmp_path / "sub" / "tokens")
+    assert resolved.security.cert == ""
+    assert resolved.tree().keys() - resolved.shared_tree().keys() == {"security"}
+
+
 @pytest.mark.parametrize(
     ("setting", "message"),
     [

@@ -17,7 +17,7 @@ SHORT = ("training.total_env_steps=1500", "algorithm.policy_hidden=16")
 
 def assert_trained(run_dir: Path, name: str) -> None:
     """Checkpoints came out of it, and each was tested in battles that were won or not."""
-    assert json.loads((run_dir / "run.json").read_text())["env"]["name"] == name
+    assert json.loads((run_dir / "run.json").read_text())["env_spec"]["name"] == name
     steps = list(csv.DictReader((run_dir / "metrics.csv").open()))
     assert int(steps[-1]["env_steps"]) >= 1500
     assert {float(row["return_mean"]) for row in steps} != {0.0}

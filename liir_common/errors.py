@@ -35,6 +35,10 @@ class RefusedError(LiirError):
     exit_code = 5
 
 
+class EpisodeLostError(LiirError):
+    """The game broke down in an episode but is there for another: the ticket can be played again."""
+
+
 @contextmanager
 def exit_on_error() -> Iterator[None]:
     """Turn a `LiirError` into one line on stderr and its exit code; anything else stays a traceback."""

@@ -19,7 +19,7 @@ from liir_common.battle.spaces import (
     joint_action,
     masked_observations,
 )
-from liir_common.errors import ConfigError
+from liir_common.errors import ConfigError, EpisodeLostError
 from liir_common.types import FloatArray
 
 
@@ -79,7 +79,8 @@ class SmacEnv(ParallelEnv[str, Observation, np.int64]):
         """Play one step.
 
         Raises:
-            RuntimeError: no battle is running, or StarCraft II broke down in this one.
+            EpisodeLostError: StarCraft II broke down, and SMAC started it again.
+            RuntimeError: no battle is running.
             ValueError: an agent's action is missing or not available.
         """
         if not self.agents:
@@ -87,7 +88,7 @@ class SmacEnv(ParallelEnv[str, Observation, np.int64]):
         reward, ended, outcome = self._game.step(joint_action(actions, self._action_spaces))
         if "battle_won" not in outcome:
             self.agents = []
-            raise RuntimeError("StarCraft II broke down and SMAC started it again; this battle is lost")
+            raise EpisodeLostError("StarCraft II broke down in this battle; SMAC started it again")
         self._observe()
         # Only `continuing_episode` makes SMAC say so.
         at_limit = bool(outcome.get("episode_limit", False))

@@ -74,7 +74,7 @@ def record(
     """
     env = EnvConfig.model_validate(manifest.config["env"])
     if env.kind != "battle":
-        raise ConfigError(f"a replay wants a policy that plays battles, got one for {env.factory}")
+        raise ConfigError(f"a replay wants a policy that plays battles, got one for {env.label}")
     if not 0 <= seed < 2**64:
         raise ConfigError(f"a seed wants an integer in [0, 2**64), got {seed}")
     map_name = map_name or env.map

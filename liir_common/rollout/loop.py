@@ -7,16 +7,21 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+import structlog
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
+from liir_common.errors import EpisodeLostError
 from liir_common.rollout.player import Ending, Player
 from liir_common.rollout.policy import Choice, Policy, act, first_stuck, stuck_message
-from liir_common.types import EnvSpec, FloatArray
+from liir_common.types import EnvSpec, FloatArray, Ticket, Trajectory
+
+log = structlog.get_logger()
 
 Env = ParallelEnv[str, Any, Any]
 NO_OP = 0
 """The action of an agent that left the game."""
+_ATTEMPTS = 3
 
 
 class LoopPlayer(Player):
@@ -32,6 +37,21 @@ class LoopPlayer(Player):
         super().__init__(spec, policy_hidden)
         self._env = env
         self._agents = env.possible_agents
+
+    def play(self, ticket: Ticket) -> Trajectory:
+        """As `Player.play`; an episode in which the game breaks down is played again.
+
+        Raises:
+            EpisodeLostError: it broke down every time.
+        """
+        for attempt in range(1, _ATTEMPTS):
+            try:
+                return super().play(ticket)
+            except EpisodeLostError as error:
+                log.warning(
+                    "an episode is lost", episode=ticket.episode_id, attempt=attempt, reason=str(error)
+                )
+        return super().play(ticket)
 
     def _run(self, policy: Policy, seed: int, choice: Choice) -> Ending:
         env, rows = self._env, self._rows

@@ -14,7 +14,7 @@ from pettingzoo.test import parallel_api_test
 
 from liir_common.battle.env import battle_spec, parallel_env
 from liir_common.config import EnvConfig
-from liir_common.errors import ConfigError
+from liir_common.errors import ConfigError, EpisodeLostError
 from liir_common.rollout.fused import FusedPlayer
 from liir_common.rollout.loop import LoopPlayer
 from liir_common.rollout.play import env_spec, make_player
@@ -109,16 +109,31 @@ def test_unavailable_actions_are_refused_before_smac_sees_them() -> None:
 
 
 @pytest.mark.usefixtures("installed")
-def test_a_breakdown_of_the_game_is_no_episode(monkeypatch: pytest.MonkeyPatch) -> None:
-    env = SmacEnv("3m", seed=1)
-    env.reset()
-    # What SMAC returns when the game's connection is gone.
-    with monkeypatch.context() as broken:
-        broken.setattr("smac.env.StarCraft2Env.step", lambda self, actions: (0, True, {}))
-        with pytest.raises(RuntimeError, match="broke down and SMAC started it again; this battle is lost"):
-            env.step(dict.fromkeys(env.agents, 1))
-    env.reset()
-    assert env.step(dict.fromkeys(env.agents, 1))[1]["ally_0"] == 0
+@pytest.mark.parametrize("breakdowns", [2, 3])
+def test_a_battle_in_which_the_game_breaks_down_is_played_again(
+    breakdowns: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    env = EnvConfig(kind="smac", options={"seed": 40})
+    player, undisturbed = make_player(env, 16), make_player(EnvConfig(), 16)
+    for each in (player, undisturbed):
+        each.load(random_weights(each.spec, 16, seed=0))
+    step, calls = sys.modules["smac.env"].StarCraft2Env.step, 0
+
+    def breaking(game: Any, actions: Any) -> Any:
+        nonlocal calls
+        calls += 1
+        # What SMAC returns when the connection to the game is gone: here in the third step of a battle.
+        lost = calls % 3 == 0 and calls <= 3 * breakdowns
+        return (0, True, {}) if lost else step(game, actions)
+
+    monkeypatch.setattr("smac.env.StarCraft2Env.step", breaking)
+    ticket = tickets(40 + breakdowns, 1)[0]
+    if breakdowns == 3:
+        with pytest.raises(EpisodeLostError, match="StarCraft II broke down"):
+            player.play(ticket)
+    else:
+        # The stand-in's third battle has the seed of the ticket.
+        assert trajectories_equal(player.play(ticket), undisturbed.play(ticket))
 
 
 @pytest.mark.usefixtures("installed")

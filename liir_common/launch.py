@@ -21,7 +21,7 @@ from rich.console import Console
 from liir_common.client import CheckpointClient, TrainingClient
 from liir_common.config import SecurityConfig
 from liir_common.display import Display, make_display
-from liir_common.errors import ConfigError, LiirError, RefusedError
+from liir_common.errors import ConfigError, LiirError, RefusedError, UnreachableError
 from liir_common.report import Summary, write_report
 from liir_common.rpc.gen.liir.v1 import checkpoint_pb2
 from liir_common.rpc.tokens import Role
@@ -181,6 +181,10 @@ class Launcher:
                     time.sleep(_POLL_S)
                 if self._stop_signal:
                     self._stop(training)
+        except UnreachableError:
+            # The learner of a run that was complete already may be gone before anybody can connect.
+            if self._learner.exit_code != 0:
+                raise
         finally:
             display.close()
 

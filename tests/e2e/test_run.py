@@ -147,6 +147,12 @@ def test_more_steps_for_a_complete_run_continue_it(undisturbed: Path, tmp_path: 
     assert_same(run_dir, undisturbed)
 
 
+def test_resuming_a_complete_run_ends_well(undisturbed: Path) -> None:
+    before = service.digests(undisturbed)
+    service.train(undisturbed, options=["--resume"])
+    assert service.digests(undisturbed) == before
+
+
 def test_the_evaluator_may_be_away_and_catches_up(undisturbed: Path, tmp_path: Path) -> None:
     """Learner and actors alone, to the end of training; then an evaluator comes."""
     run_dir = tmp_path / "run"

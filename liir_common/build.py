@@ -1,6 +1,7 @@
 """What this program is: which episodes it plays, and which commit it runs from."""
 
 import hashlib
+import os
 import subprocess
 from functools import cache
 from importlib.metadata import version
@@ -26,7 +27,12 @@ def build() -> str:
 
 @cache
 def git_commit() -> str:
-    """Commit of the checkout this runs from ("+" marks uncommitted changes), or "unknown" outside one."""
+    """Commit this runs from ("+" marks uncommitted changes): of the checkout, or as GIT_COMMIT has it.
+
+    The environment variable is for images, which hold no checkout; without either it is "unknown".
+    """
+    if commit := os.environ.get("GIT_COMMIT"):
+        return commit
     command = ["git", "-C", str(_PACKAGE), "describe", "--always", "--dirty=+", "--abbrev=12", "--exclude=*"]
     try:
         done = subprocess.run(command, capture_output=True, text=True, check=True)

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from liir_common import options
-from liir_common.errors import ConfigError, exit_on_error
+from liir_common.errors import ConfigError, UnreachableError, exit_on_error
 
 app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, add_completion=False)
 checkpoints = typer.Typer(no_args_is_help=True, help="Frozen checkpoints of a running learner.")
@@ -120,6 +120,20 @@ def status(
     security = options.load_security(config, settings)
     with TrainingClient(learner, 10, security) as client, refusals_explained():
         print(MessageToJson(client.status()))
+
+
+@app.command()
+def health(
+    learner: options.Learner, config: options.ConfigFile = None, settings: options.Settings = None
+) -> None:
+    """Exit with 0 if a learner serves, with 3 if it does not; for health checks."""
+    from liir_common.client import TrainingClient
+    from liir_common.rpc.tokens import Role
+
+    security = options.load_security(config, settings)
+    with TrainingClient(learner, 3, security, Role.READER) as client:
+        if not client.serving():
+            raise UnreachableError(f"the learner at {learner} is leaving")
 
 
 @app.command()

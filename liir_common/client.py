@@ -8,6 +8,7 @@ from contextlib import contextmanager
 
 import grpc
 import numpy as np
+from grpc_health.v1 import health_pb2, health_pb2_grpc
 from numpy.typing import NDArray
 
 from liir_common.checkpoint import Manifest, unpack
@@ -180,6 +181,12 @@ class TrainingClient:
     def close(self) -> None:
         """Leave."""
         self._channel.close()
+
+    def serving(self) -> bool:
+        """Whether the learner calls itself healthy; false while it is leaving."""
+        stub = health_pb2_grpc.HealthStub(self._channel)
+        answer = stub.Check(health_pb2.HealthCheckRequest(), timeout=DEADLINE_S)  # type: ignore[attr-defined]
+        return bool(answer.status == health_pb2.HealthCheckResponse.SERVING)
 
     def config(self) -> Config:
         """The run's resolved configuration; `security` is each process's own and not part of it."""

@@ -211,6 +211,13 @@ class EvaluationConfig(Section):
     metrics_port: int = Field(9103, ge=0, le=65535)
 
 
+class MetricsConfig(Section):
+    """Prometheus endpoints of all processes; each section above has its port."""
+
+    host: str = "127.0.0.1"
+    """Address that /metrics is served on, without encryption and to whoever asks."""
+
+
 def _absolute(path: str) -> str:
     return str(Path(path).expanduser().absolute()) if path else ""
 
@@ -260,6 +267,7 @@ class Config(BaseSettings):
     actors: ActorsConfig = ActorsConfig()
     learner: LearnerConfig = LearnerConfig()
     evaluation: EvaluationConfig = EvaluationConfig()
+    metrics: MetricsConfig = MetricsConfig()
     security: SecurityConfig = SecurityConfig()
 
     @model_validator(mode="before")

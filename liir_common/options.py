@@ -19,6 +19,9 @@ RunDir = Annotated[
     Path | None, typer.Option("--run-dir", help="Run directory; a new one under runs/ if absent.")
 ]
 Resume = Annotated[bool, typer.Option("--resume", help="Go on with the run in the run directory.")]
+ResumeIfBegun = Annotated[
+    bool, typer.Option("--resume-if-begun", help="Resume a run that is there, or begin it; for supervisors.")
+]
 Learner = Annotated[str, typer.Option("--learner", help="HOST:PORT of the learner.")]
 
 
@@ -55,8 +58,13 @@ def load_run_config(
     return config.from_tree(config.merge(kept, config.parse_settings(settings or ())))
 
 
+def holds_run(run_dir: Path) -> bool:
+    """Whether a run was begun there; its configuration is the last that it writes before it trains."""
+    return (run_dir / "config.yaml").exists()
+
+
 def _check_run_dir(run_dir: Path, resume: bool) -> None:
-    exists = (run_dir / "run.json").exists()
+    exists = holds_run(run_dir)
     if exists and not resume:
         raise ConfigError(f"{run_dir} holds a run already; go on with --resume, or name another --run-dir")
     if resume and not exists:

@@ -45,12 +45,13 @@ class Fleet:
         """Play for the learner at `address`; Ray must be initialised."""
         self._address = address
         self._tree = config.tree()
-        # An actor waits more than it computes and does not say how many cores it needs: no CPU is
-        # reserved, so that any number of actors fits, spread evenly over the nodes.
-        self._actor_class: Any = ray.remote(num_cpus=0, scheduling_strategy="SPREAD")(RolloutActor)
+        # An actor waits more than it computes: it reserves so little that any number fits, spread evenly
+        # over the nodes, and yet none goes to a node without CPUs, which a cluster's head should be.
+        self._actor_class: Any = ray.remote(num_cpus=0.001, scheduling_strategy="SPREAD")(RolloutActor)
         self._members = [_Member(f"actor-{i:03d}") for i in range(config.actors.count)]
         self._waits = {member.name: backoffs() for member in self._members}
         # Starting is work for a core: one at a time on each, so that the first play while others start.
+        metrics.ACTORS_WANTED.set(config.actors.count)
         self._starting_at_once = max(1, int(ray.cluster_resources().get("CPU", 1)))
 
     def run(self) -> None:

@@ -15,10 +15,12 @@ def learner(
     config: options.ConfigFile = None,
     settings: options.Settings = None,
     resume: options.Resume = False,
+    resume_if_begun: options.ResumeIfBegun = False,
 ) -> None:
     """Train a run: serve tickets to actors, checkpoints to evaluators."""
     logs.configure("learner")
     path = run_dir or Path("runs/learner")
+    resume = resume or (resume_if_begun and options.holds_run(path))
     with exit_on_error():
         resolved = options.load_run_config(config, settings, path, resume)
         spec = env_spec(resolved.env)

@@ -136,7 +136,9 @@ class CheckpointService(checkpoint_pb2_grpc.CheckpointServiceServicer):
         metrics.EVALUATED_ENV_STEPS.set(newest.env_steps)
         for actions in ("greedy", "sampled"):
             stats = getattr(newest, actions)
-            metrics.WIN_RATE.labels(self._run.config.env.label, actions).set(stats.wins / stats.episodes)
+            labels = (self._run.config.env.label, actions)
+            metrics.WIN_RATE.labels(*labels).set(stats.wins / stats.episodes)
+            metrics.EVALUATION_RETURN.labels(*labels).set(stats.return_mean)
 
 
 def _limit(asked: int) -> int:

@@ -43,7 +43,7 @@ async def serve(config: Config, run: RunDirectory, spec: EnvSpec) -> None:
     server = Server(
         config.learner.host, config.learner.port, config.security, insecure=config.learner.insecure
     )
-    metrics_port = metrics.serve(config.learner.metrics_port, "learner.metrics_port")
+    metrics_port = metrics.serve(config.metrics.host, config.learner.metrics_port, "learner.metrics_port")
     algorithm = make_algorithm(
         spec, config.algorithm, seeds.derive(config.seed, seeds.LEARNER), device(config.learner.device)
     )
@@ -57,6 +57,7 @@ async def serve(config: Config, run: RunDirectory, spec: EnvSpec) -> None:
         asyncio.run_coroutine_threadsafe(checkpoints.changed(), loop)
 
     trainer = Trainer(run, algorithm, publish, frozen)
+    metrics.BATCHES_WAITING.set_function(trainer.batches.qsize)
     rollouts = RolloutService(config, spec, trainer.next_batch, trainer.batches)
     checkpoints = CheckpointService(run)
     stopping = asyncio.Event()
@@ -74,7 +75,7 @@ async def serve(config: Config, run: RunDirectory, spec: EnvSpec) -> None:
         loop.add_signal_handler(signum, stop, signum.name)
 
     await server.start()
-    run.write_endpoints({"address": server.local_address, "metrics": f"127.0.0.1:{metrics_port}"})
+    run.write_endpoints({"address": server.local_address, "metrics": f"{config.metrics.host}:{metrics_port}"})
     log.info("serving", address=f"{config.learner.host}:{server.port}", run=str(run.path))
     expiry = asyncio.create_task(rollouts.expire_tickets())
     try:

@@ -160,7 +160,7 @@ class Trainer:
         steps = sum(t.length for t in trajectories)
         metrics.ENV_STEPS.labels(self.config.env.label).inc(steps)
         metrics.EPISODES.labels(self.config.env.label).inc(len(trajectories))
-        metrics.LEARNER_STEP.set(counters.learner_step)
+        self._show_progress()
         metrics.EPISODE_RETURN.set(episode_figures["return_mean"])
         metrics.EPISODE_LENGTH.set(episode_figures["length_mean"])
         metrics.POLICY_LAG.set(policy["policy_lag"])
@@ -187,10 +187,19 @@ class Trainer:
                 sha256=hashlib.sha256(data).hexdigest(),
                 size_bytes=len(data),
             )
-            if self.run_directory.checkpoints.publish(manifest, data):
-                metrics.CHECKPOINT_TIME.set(manifest.created)
-            metrics.CHECKPOINTS.set(len(self.run_directory.checkpoints.manifests))
+            self.run_directory.checkpoints.publish(manifest, data)
+            self._show_progress()
             self._frozen()
+
+    def _show_progress(self) -> None:
+        """Set the gauges that go on where they were when a run is resumed."""
+        counters, manifests = self.progress.counters, self.run_directory.checkpoints.manifests
+        metrics.LEARNER_STEP.set(counters.learner_step)
+        metrics.RUN_ENV_STEPS.set(counters.env_steps)
+        metrics.RUN_ENV_STEPS_WANTED.set(self.config.training.total_env_steps)
+        metrics.CHECKPOINTS.set(len(manifests))
+        if manifests:
+            metrics.CHECKPOINT_TIME.set(manifests[-1].created)
 
     def _save(self) -> None:
         """Keep everything the next learner step depends on."""
@@ -235,6 +244,7 @@ class Trainer:
             log.info("resumed", **asdict(counters))
         self.progress.counters = counters
         self.run_directory.metrics.keep("learner_step", counters.learner_step)
+        self._show_progress()
 
 
 def _section(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:

@@ -7,7 +7,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 .DEFAULT_GOAL := help
 
 help: ## Show this list
-	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 18
 
 # Stamped, so that set-up costs nothing once the pinned requirements are in.
 $(VENV)/.installed: requirements.txt requirements-dev.txt pyproject.toml
@@ -34,6 +34,15 @@ browser: setup ## Install Chromium, which the tests of the replay page want
 fuzz: setup ## Damaged messages, 100 000 into the codec and 5 000 into a learner
 	$(BIN)/python -m tests.security.fuzz_wire $(ARGS)
 
+test-monitoring: setup ## Run the tests that need prometheus and promtool (apt-get install prometheus)
+	$(BIN)/pytest -m prometheus $(ARGS)
+
+test-compose: setup ## Run docker-compose.yml through deaths, stops and resumes; needs docker
+	$(BIN)/pytest -m compose $(ARGS)
+
+dashboard: setup ## Write the Grafana dashboard from its program
+	$(BIN)/python deploy/grafana/dashboard.py > deploy/grafana/dashboards/liir.json
+
 lint: setup ## Check style, types, import rules and generated code
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -54,4 +63,4 @@ proto: setup ## Generate the gRPC code from proto/
 proto-check: proto
 	git diff --exit-code -- $(GEN)
 
-.PHONY: help setup train test browser fuzz lint proto proto-check
+.PHONY: help setup train test browser fuzz test-monitoring test-compose dashboard lint proto proto-check

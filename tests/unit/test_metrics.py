@@ -1,0 +1,88 @@
+"""Every metric is described in docs/metrics.md, drawn in the dashboard, and nothing else is."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import yaml
+from prometheus_client.metrics import MetricWrapperBase
+
+from liir_common import metrics
+
+ROOT = Path(__file__).parents[2]
+DASHBOARD = ROOT / "deploy/grafana/dashboards/liir.json"
+RULES = ROOT / "deploy/prometheus/rules.yml"
+NAME = re.compile(r"\b(?:liir|process|python)_\w+")
+UNIT_SUFFIXES = {"seconds": "s", "bytes": "bytes", "steps": "steps", "versions": "versions"}
+
+
+def defined() -> dict[str, tuple[str, str, str]]:
+    """Name → (type, labels, help) of every metric of the service."""
+    out = {}
+    for metric in vars(metrics).values():
+        if isinstance(metric, MetricWrapperBase):
+            (family,) = metric.describe()
+            name = family.name + ("_total" if family.type == "counter" else "")
+            out[name] = (family.type, ", ".join(metric._labelnames) or "–", family.documentation)
+    return out
+
+
+def documented() -> dict[str, tuple[str, str, str, str]]:
+    """Name → (type, labels, unit, meaning) of the rows of docs/metrics.md."""
+    rows = re.findall(
+        r"^\| `(\w+)` \| (\w+) \| (.*?) \| (.*?) \| (.*?) \|$", (ROOT / "docs/metrics.md").read_text(), re.M
+    )
+    return {name: tuple(rest) for name, *rest in rows}  # type: ignore[misc]
+
+
+def rules() -> list[dict[str, str]]:
+    """Recorded figures and alerts."""
+    (group,) = yaml.safe_load(RULES.read_text())["groups"]
+    return group["rules"]  # type: ignore[no-any-return]
+
+
+def drawn() -> set[str]:
+    """Names of the metrics behind the dashboard's expressions, recorded figures resolved."""
+    recorded = {rule["record"]: rule["expr"] for rule in rules() if "record" in rule}
+    names: set[str] = set()
+    for panel in json.loads(DASHBOARD.read_text())["panels"]:
+        for target in panel.get("targets", ()):
+            expression = target["expr"]
+            for record in re.findall(r"liir:[\w:]+", expression):
+                expression += recorded[record]
+            names |= set(NAME.findall(expression))
+    return {re.sub("_(bucket|sum|count)$", "", name) for name in names}
+
+
+def test_the_document_has_a_row_for_every_metric_and_no_other() -> None:
+    rows = {name: (kind, labels, text) for name, (kind, labels, _, text) in documented().items()}
+    assert rows == defined()
+
+
+def test_units_are_given_and_agree_with_the_names() -> None:
+    for name, (_, _, unit, _) in documented().items():
+        assert unit, name
+        suffix = name.removesuffix("_total").rpartition("_")[2]
+        assert unit == UNIT_SUFFIXES.get(suffix, unit), name
+
+
+def test_every_metric_is_drawn_and_everything_drawn_exists() -> None:
+    ours = {name for name in drawn() if name.startswith("liir_")}
+    assert ours == set(defined())
+    assert drawn() - ours <= {"process_resident_memory_bytes", "process_cpu_seconds_total"}
+
+
+def test_alerts_watch_metrics_that_exist() -> None:
+    for rule in rules():
+        names = {re.sub("_(bucket|sum|count)$", "", name) for name in NAME.findall(rule["expr"])}
+        assert names <= set(defined()), rule
+
+
+def test_the_dashboard_is_what_its_program_writes() -> None:
+    program = ROOT / "deploy/grafana/dashboard.py"
+    written = subprocess.run([sys.executable, str(program)], check=True, capture_output=True, text=True)
+    assert DASHBOARD.read_text() == written.stdout, "run make dashboard"

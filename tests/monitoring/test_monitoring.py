@@ -1,0 +1,136 @@
+"""Rules, alerts and dashboard against the real Prometheus, which scrapes a real training."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import subprocess
+import time
+import urllib.parse
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from liir_common.client import CheckpointClient
+from liir_common.errors import LiirError
+from tests.e2e import service
+from tests.unit.test_metrics import DASHBOARD, defined
+
+pytestmark = pytest.mark.prometheus
+
+CONFIG = Path(__file__).parents[2] / "deploy/prometheus"
+RATE_INTERVAL = "10s"
+
+
+def program(name: str) -> str:
+    """Path of a program of the prometheus package."""
+    path = shutil.which(name)
+    assert path, (
+        f"{name} is not on the PATH; Debian has it: apt-get install --no-install-recommends prometheus"
+    )
+    return path
+
+
+def test_configuration_is_valid_and_alerts_fire_when_they_should() -> None:
+    for arguments in (("check", "config", "prometheus.yml"), ("test", "rules", "rules_test.yml")):
+        done = subprocess.run([program("promtool"), *arguments], cwd=CONFIG, capture_output=True, text=True)
+        assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_every_alert_has_a_case_in_which_it_fires() -> None:
+    (group,) = yaml.safe_load((CONFIG / "rules.yml").read_text())["groups"]
+    cases = yaml.safe_load((CONFIG / "rules_test.yml").read_text())["tests"]
+    fired = {
+        case["alertname"] for test in cases for case in test.get("alert_rule_test", ()) if case["exp_alerts"]
+    }
+    assert fired == {rule["alert"] for rule in group["rules"] if "alert" in rule}
+
+
+def metrics_addresses(run_dir: Path) -> dict[str, str]:
+    """HOST:PORT of each process's /metrics, by scrape job, from the processes' logs."""
+    out = {}
+    for job in ("learner", "actors", "evaluator"):
+        log = run_dir / "logs" / f"{job}.log"
+        service.wait_for(lambda log=log: "serving metrics" in log.read_text(), f"the metrics of {job}")  # type: ignore[misc]
+        lines = [json.loads(line) for line in log.read_text().splitlines() if line.startswith("{")]
+        url = next(line["url"] for line in lines if line["event"] == "serving metrics")
+        out[job] = urllib.parse.urlsplit(url).netloc
+    return out
+
+
+@contextmanager
+def prometheus(folder: Path, addresses: dict[str, str]) -> Iterator[str]:
+    """The deployed configuration with other addresses and a quicker pulse; yields its URL."""
+    config = yaml.safe_load((CONFIG / "prometheus.yml").read_text())
+    config["global"] = {"scrape_interval": "1s", "evaluation_interval": "1s"}
+    config["rule_files"] = [str(CONFIG / name) for name in config["rule_files"]]
+    config["scrape_configs"] = [
+        scrape | {"static_configs": [{"targets": [addresses[scrape["job_name"]]]}]}
+        for scrape in config["scrape_configs"]
+        if scrape["job_name"] in addresses
+    ]
+    (folder / "prometheus.yml").write_text(yaml.safe_dump(config))
+    port = service.free_port()
+    arguments = [
+        program("prometheus"),
+        f"--config.file={folder / 'prometheus.yml'}",
+        f"--storage.tsdb.path={folder / 'data'}",
+        f"--web.listen-address=127.0.0.1:{port}",
+    ]
+    with (folder / "prometheus.log").open("wb") as log:
+        process = subprocess.Popen(arguments, stdout=log, stderr=log)
+    try:
+        yield f"http://127.0.0.1:{port}"
+    finally:
+        process.terminate()
+        process.wait(30)
+
+
+def ask(url: str, path: str, **parameters: str) -> Any:
+    """One call of Prometheus' HTTP interface."""
+    with urllib.request.urlopen(
+        f"{url}/api/v1/{path}?{urllib.parse.urlencode(parameters)}", timeout=10
+    ) as page:
+        return json.load(page)["data"]
+
+
+def is_drawn(url: str, expression: str, begin: float) -> bool:
+    """Whether a panel has a point to draw."""
+    expression = expression.replace("$__rate_interval", RATE_INTERVAL)
+    data = ask(url, "query_range", query=expression, start=str(begin), end=str(time.time()), step="1")
+    return any(math.isfinite(float(value)) for line in data["result"] for _, value in line["values"])
+
+
+def test_every_panel_draws_a_real_training(tmp_path: Path) -> None:
+    run_dir, begin = tmp_path / "run", time.time()
+    panels = json.loads(DASHBOARD.read_text())["panels"]
+    expressions = {target["expr"] for panel in panels for target in panel.get("targets", ())}
+    with service.training(run_dir, "training.total_env_steps=10000000", "learner.threads=1"):
+        service.wait_for(lambda: service.learner_step(run_dir) >= 3, "the third learner step")
+        with prometheus(tmp_path, metrics_addresses(run_dir)) as url:
+            refuse_a_call(run_dir)
+            deadline = time.monotonic() + 60
+            empty = set(expressions)
+            while empty and time.monotonic() < deadline:
+                time.sleep(2)
+                empty = {expression for expression in empty if not is_drawn(url, expression, begin)}
+            assert not empty
+            names = set(ask(url, "label/__name__/values"))
+            assert ask(url, "query", query='ALERTS{alertstate="firing"}')["result"] == []
+    histograms = {name for name, (kind, *_) in defined().items() if kind == "histogram"}
+    assert set(defined()) - histograms | {f"{name}_bucket" for name in histograms} <= names
+
+
+def refuse_a_call(run_dir: Path) -> None:
+    """An error for the panel of errors."""
+    with (
+        CheckpointClient(service.endpoints(run_dir)["address"]) as client,
+        pytest.raises(LiirError, match="no checkpoint of episode 7"),
+    ):
+        client.download(7)

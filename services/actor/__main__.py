@@ -22,7 +22,9 @@ def actors(
     with exit_on_error():
         security = options.load_security(config, settings)
         resolved = learners_config(learner, settings or (), security, Role.ACTOR)
-        metrics.serve(resolved.metrics.host, resolved.actors.metrics_port, "actors.metrics_port")
+        metrics.serve(
+            metrics.DRIVER, resolved.metrics.host, resolved.actors.metrics_port, "actors.metrics_port"
+        )
         # Compiled once here; every actor finds the result in the cache.
         warm_up(resolved.env)
         start_ray(resolved.actors)

@@ -20,7 +20,12 @@ def evaluator(
     with exit_on_error():
         security = options.load_security(config, settings)
         resolved = learners_config(learner, settings or (), security, Role.EVALUATOR)
-        metrics.serve(resolved.metrics.host, resolved.evaluation.metrics_port, "evaluation.metrics_port")
+        metrics.serve(
+            metrics.EVALUATOR,
+            resolved.metrics.host,
+            resolved.evaluation.metrics_port,
+            "evaluation.metrics_port",
+        )
         player = make_player(resolved.env, resolved.algorithm.policy_hidden)
         Evaluator(learner, resolved, player).run()
 

@@ -43,7 +43,9 @@ async def serve(config: Config, run: RunDirectory, spec: EnvSpec) -> None:
     server = Server(
         config.learner.host, config.learner.port, config.security, insecure=config.learner.insecure
     )
-    metrics_port = metrics.serve(config.metrics.host, config.learner.metrics_port, "learner.metrics_port")
+    metrics_port = metrics.serve(
+        metrics.LEARNER, config.metrics.host, config.learner.metrics_port, "learner.metrics_port"
+    )
     algorithm = make_algorithm(
         spec, config.algorithm, seeds.derive(config.seed, seeds.LEARNER), device(config.learner.device)
     )

@@ -121,6 +121,8 @@ def test_every_panel_draws_a_real_training(tmp_path: Path) -> None:
                 time.sleep(2)
                 empty = {expression for expression in empty if not is_drawn(url, expression, begin)}
             assert not empty
+            twice = "count by (__name__) (count by (__name__, job) ({__name__=~'liir_.*'})) > 1"
+            assert ask(url, "query", query=twice)["result"] == []
             names = set(ask(url, "label/__name__/values"))
             assert ask(url, "query", query='ALERTS{alertstate="firing"}')["result"] == []
     histograms = {name for name, (kind, *_) in defined().items() if kind == "histogram"}

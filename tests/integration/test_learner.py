@@ -259,10 +259,13 @@ def test_health_and_reflection(learner: tuple[str, Path]) -> None:
     assert "grpc.health.v1.Health" in services
 
 
-def test_stop_saves_and_resume_goes_on(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("begin", "resume"), [([], ["--resume"]), (["--resume-if-begun"], ["--resume-if-begun"])]
+)
+def test_stop_saves_and_resume_goes_on(begin: list[str], resume: list[str], tmp_path: Path) -> None:
     run_dir = tmp_path / "run"
     options = ("--run-dir", str(run_dir), *service.arguments(["training.batch_episodes=4"]))
-    process = service.start("learner", *options)
+    process = service.start("learner", *begin, *options)
     service.wait_for((run_dir / "endpoints.json").exists, "the learner's start")
     address = service.endpoints(run_dir)["address"]
     play_batches(address, 2)
@@ -271,7 +274,7 @@ def test_stop_saves_and_resume_goes_on(tmp_path: Path) -> None:
         training.stop("test")
     service.finish(process)
     (run_dir / "endpoints.json").unlink()
-    process = service.start("learner", "--resume", *options)
+    process = service.start("learner", *resume, *options)
     service.wait_for((run_dir / "endpoints.json").exists, "the learner's second start")
     with Actor(service.endpoints(run_dir)["address"]) as actor:
         actor.ask()
@@ -298,6 +301,12 @@ def test_an_open_address_is_refused_unless_asked_for(tmp_path: Path) -> None:
         "learner", "--run-dir", str(tmp_path / "run"), *service.arguments(["learner.host=0.0.0.0"])
     )
     assert "learner.insecure=true" in service.finish(process, code=2)
+
+
+def test_the_health_command_says_whether_a_learner_serves(learner: tuple[str, Path]) -> None:
+    service.finish(service.start("health", "--learner", learner[0]))
+    silent = service.start("health", "--learner", f"127.0.0.1:{service.free_port()}")
+    assert "no learner answered" in service.finish(silent, code=3)
 
 
 def test_an_unreachable_learner_is_an_error_that_says_so() -> None:

@@ -32,7 +32,7 @@ def program(name: str) -> str:
     """Path of a program of the prometheus package."""
     path = shutil.which(name)
     assert path, (
-        f"{name} is not on the PATH; Debian has it: apt-get install --no-install-recommends prometheus"
+        f"{name} is not on the PATH; make test-monitoring gets it from Debian's package of Prometheus"
     )
     return path
 

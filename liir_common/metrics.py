@@ -67,6 +67,7 @@ DUPLICATES = LEARNER.counter("liir_duplicate_trajectories_total", "Trajectories 
 RECEIVED_BYTES = LEARNER.counter("liir_trajectory_bytes_total", "Bytes of trajectories received")
 ACTOR_PLAY_SECONDS = LEARNER.counter("liir_actor_play_seconds_total", "Seconds all actors spent playing")
 ACTOR_WAIT_SECONDS = LEARNER.counter("liir_actor_wait_seconds_total", "Seconds all actors waited for tickets")
+ACTOR_MEMORY = LEARNER.gauge("liir_actor_peak_memory_bytes", "Peak resident memory, connected actors' sum")
 RPC_ERRORS = LEARNER.counter("liir_rpc_errors_total", "Calls refused, by status code", ["method", "code"])
 
 # Learner: checkpoints and their tests.

@@ -259,7 +259,11 @@ def build() -> dashboard.Dashboard:
                 ),
             ).min(0),
             series(
-                "Memory", "Resident, per process.", "bytes", ("process_resident_memory_bytes", "{{job}}")
+                "Memory",
+                "Resident, per process; of the actors the sum of their peaks, shared pages counted by each.",
+                "bytes",
+                ("process_resident_memory_bytes", "{{job}}"),
+                ("liir_actor_peak_memory_bytes", "all actors, peak"),
             ).min(0),
             series(
                 "CPU",

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import queue
+import resource
+import sys
 import time
 from collections.abc import Iterable
 
@@ -95,7 +97,11 @@ class RolloutActor:
                     begin = time.perf_counter()
                     trajectory = self._player.play(ticket)
                     end = time.perf_counter()
-                    stats = rollout_pb2.ActorStats(play_seconds=end - begin, wait_seconds=begin - idle_since)
+                    stats = rollout_pb2.ActorStats(
+                        play_seconds=end - begin,
+                        wait_seconds=begin - idle_since,
+                        peak_memory_bytes=_peak_memory(),
+                    )
                     idle_since = end
                     encoded = codec.encode_trajectory(trajectory, stats, self._compress)
                     outgoing.put(rollout_pb2.PlayRequest(trajectory=encoded))
@@ -103,3 +109,9 @@ class RolloutActor:
                     log.info("drained", reason=message.drain.reason)
                     return bool(message.drain.run_complete)
         return False
+
+
+def _peak_memory() -> int:
+    """Most memory that this process has had resident, in bytes."""
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit

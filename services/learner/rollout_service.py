@@ -38,6 +38,8 @@ class ActorStream:
     """Messages to send; None ends the stream, an exception ends it with an error."""
     policy_version: int = -1
     """The version sent last."""
+    peak_memory: int = 0
+    """Bytes, as the actor says."""
 
 
 class RolloutService(rollout_pb2_grpc.RolloutServiceServicer):
@@ -92,6 +94,7 @@ class RolloutService(rollout_pb2_grpc.RolloutServiceServicer):
         while True:
             await asyncio.sleep(min(_EXPIRY_CHECK_S, timeout))
             metrics.TICKETS.set(self.outstanding)
+            metrics.ACTOR_MEMORY.set(sum(stream.peak_memory for stream in self._streams))
             self._reissued(self._intake.expire(time.monotonic() - timeout), "timeout")
 
     async def Play(
@@ -171,6 +174,7 @@ class RolloutService(rollout_pb2_grpc.RolloutServiceServicer):
     def _take(self, message: rollout_pb2.Trajectory, stream: ActorStream) -> None:
         metrics.RECEIVED_BYTES.inc(message.ByteSize())
         metrics.ACTOR_PLAY_SECONDS.inc(max(0.0, message.stats.play_seconds))
+        stream.peak_memory = message.stats.peak_memory_bytes
         metrics.ACTOR_WAIT_SECONDS.inc(max(0.0, message.stats.wait_seconds))
         if not self._intake.accept(stream, codec.decode_trajectory(message, self._spec)):
             metrics.DUPLICATES.inc()

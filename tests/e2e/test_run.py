@@ -189,6 +189,7 @@ def test_metrics_of_all_three_processes(tmp_path: Path) -> None:
     assert pages["learner"]["liir_learner_step"] >= 6
     assert pages["learner"]["liir_actors_connected"] == 2
     assert pages["learner"]["liir_actor_play_seconds_total"] > 0
+    assert 2 * 50e6 < pages["learner"]["liir_actor_peak_memory_bytes"] < 2 * 1e9
     assert pages["actors"]["liir_driver_actors_alive"] == 2
     assert pages["evaluator"]['liir_evaluation_episodes_total{actions="greedy"}'] > 0
 

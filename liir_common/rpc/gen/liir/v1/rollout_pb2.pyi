@@ -112,12 +112,14 @@ class Trajectory(_message.Message):
     def __init__(self, episode_id: _Optional[int] = ..., policy_version: _Optional[int] = ..., obs: _Optional[_Union[_tensor_pb2.Tensor, _Mapping]] = ..., state: _Optional[_Union[_tensor_pb2.Tensor, _Mapping]] = ..., mask: _Optional[_Union[_tensor_pb2.Tensor, _Mapping]] = ..., alive: _Optional[_Union[_tensor_pb2.Tensor, _Mapping]] = ..., actions: _Optional[_Union[_tensor_pb2.Tensor, _Mapping]] = ..., log_mu: _Optional[_Union[_tensor_pb2.Tensor, _Mapping]] = ..., reward: _Optional[_Union[_tensor_pb2.Tensor, _Mapping]] = ..., terminated: _Optional[bool] = ..., truncated: _Optional[bool] = ..., info: _Optional[_Iterable[float]] = ..., stats: _Optional[_Union[ActorStats, _Mapping]] = ...) -> None: ...
 
 class ActorStats(_message.Message):
-    __slots__ = ("play_seconds", "wait_seconds")
+    __slots__ = ("play_seconds", "wait_seconds", "peak_memory_bytes")
     PLAY_SECONDS_FIELD_NUMBER: _ClassVar[int]
     WAIT_SECONDS_FIELD_NUMBER: _ClassVar[int]
+    PEAK_MEMORY_BYTES_FIELD_NUMBER: _ClassVar[int]
     play_seconds: float
     wait_seconds: float
-    def __init__(self, play_seconds: _Optional[float] = ..., wait_seconds: _Optional[float] = ...) -> None: ...
+    peak_memory_bytes: int
+    def __init__(self, play_seconds: _Optional[float] = ..., wait_seconds: _Optional[float] = ..., peak_memory_bytes: _Optional[int] = ...) -> None: ...
 
 class Ack(_message.Message):
     __slots__ = ("episode_id",)

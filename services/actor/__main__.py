@@ -28,8 +28,11 @@ def actors(
         # Compiled once here; every actor finds the result in the cache.
         warm_up(resolved.env)
         start_ray(resolved.actors)
+        fleet = Fleet(learner, resolved)
+        # Ray has put in a handler of its own, and an exception raised inside its calls is an error to it.
+        signal.signal(signal.SIGTERM, lambda *_: fleet.stop())
         try:
-            Fleet(learner, resolved).run()
+            fleet.run()
         finally:
             ray.shutdown()
 

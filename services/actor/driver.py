@@ -49,19 +49,24 @@ class Fleet:
         # over the nodes, and yet none goes to a node without CPUs, which a cluster's head should be.
         self._actor_class: Any = ray.remote(num_cpus=0.001, scheduling_strategy="SPREAD")(RolloutActor)
         self._members = [_Member(f"actor-{i:03d}") for i in range(config.actors.count)]
+        self._stopping = False
         self._waits = {member.name: backoffs() for member in self._members}
         # Starting is work for a core: one at a time on each, so that the first play while others start.
         metrics.ACTORS_WANTED.set(config.actors.count)
         self._starting_at_once = max(1, int(ray.cluster_resources().get("CPU", 1)))
 
+    def stop(self) -> None:
+        """Let `run` return soon; may be called by a signal handler."""
+        self._stopping = True
+
     def run(self) -> None:
-        """Return when every actor was told that the run is complete.
+        """Return when every actor was told that the run is complete, or after `stop`.
 
         Raises:
             RefusedError: the learner will not have an actor.
             ray.exceptions.RayTaskError: an actor failed; its traceback is part of the message.
         """
-        while self._members:
+        while self._members and not self._stopping:
             starting = self._start_due()
             metrics.ACTORS_ALIVE.set(sum(member.run is not None for member in self._members))
             self._collect_ended(_POLL_WHILE_STARTING_S if starting else _POLL_S)

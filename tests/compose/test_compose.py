@@ -14,9 +14,11 @@ import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import grpc
 import pytest
 
 from liir_common.client import CheckpointClient, TrainingClient
+from liir_common.errors import LiirError
 from liir_common.rpc.gen.liir.v1 import training_pb2
 
 pytestmark = [pytest.mark.compose, pytest.mark.timeout(900)]
@@ -82,10 +84,11 @@ class Compose:
         self("exec", service, "sh", "-c", f"kill -KILL {process}")
 
     def restarts(self, service: str) -> int:
-        """How often the engine has started the first container of a service again."""
-        container = self("ps", "--quiet", service).split()[0]
-        inspect = ["docker", "inspect", "--format", "{{.RestartCount}}", container]
-        return int(subprocess.run(inspect, check=True, capture_output=True, text=True).stdout)
+        """How often the engine has started containers of a service again."""
+        containers = self("ps", "--all", "--quiet", service).split()
+        inspect = ["docker", "inspect", "--format", "{{.RestartCount}}", *containers]
+        counts = subprocess.run(inspect, check=True, capture_output=True, text=True).stdout
+        return sum(map(int, counts.split()))
 
 
 @pytest.fixture
@@ -108,8 +111,8 @@ def wait_for(condition: Callable[[], object], what: str, timeout_s: float = 180.
         try:
             if condition():
                 return
-        except (OSError, AssertionError):
-            pass
+        except (OSError, LiirError, grpc.RpcError) as error:
+            print(f"{what}: {error}")
         assert time.monotonic() < deadline, f"{what}: not within {timeout_s:g} s"
         time.sleep(1)
 

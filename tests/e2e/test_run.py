@@ -176,6 +176,21 @@ def test_the_evaluator_may_be_away_and_catches_up(undisturbed: Path, tmp_path: P
     assert_same(run_dir, undisturbed)
 
 
+def test_the_actor_driver_ends_without_error_when_asked(tmp_path: Path) -> None:
+    run_dir = tmp_path / "run"
+    learner = service.start("learner", "--run-dir", str(run_dir), *service.arguments([]))
+    service.wait_for((run_dir / "endpoints.json").exists, "the learner's start")
+    actors = service.start("actors", "--learner", service.endpoints(run_dir)["address"])
+    try:
+        service.wait_for(lambda: service.learner_step(run_dir) >= 1, "the first learner step")
+        actors.terminate()
+        assert "SIGTERM" not in service.finish(actors)
+    finally:
+        for process in (actors, learner):
+            process.terminate()
+            process.communicate(timeout=60)
+
+
 def test_metrics_of_all_three_processes(tmp_path: Path) -> None:
     run_dir = tmp_path / "run"
     with service.training(run_dir, "training.total_env_steps=1000000") as process:

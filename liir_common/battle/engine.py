@@ -235,13 +235,17 @@ def _play_loop(tables, battle, upwards):
         # Unsigned, so that no index needs a test for being negative.
         i = np.uint64(k if upwards else n - 1 - k)
         if battle.units[i].alive:
+            # Without a branch: written in any case, and kept if it walks.
+            battle.walkers[walkers] = i
             walkers += _act(tables, battle, i, now, upwards)
     if tables.rules[0].has_missiles:
         _fly_missiles(tables, battle, now)
     if tables.rules[0].has_areas:
         _blast_all(tables, battle, now)
-    if walkers:
-        _separate(tables, battle, now)
+    for k in range(walkers):
+        i = battle.walkers[k if upwards else walkers - 1 - k]
+        if battle.units[i].alive:
+            _separate(tables, battle, i, now)
     battle.clock[0] = now + 1.0
 
 
@@ -622,23 +626,24 @@ def _displace(tables, battle, i, x, y):
 
 
 @inlined
-def _separate(tables, battle, now):
-    """Push overlapping discs apart; only units that walked in this loop can have made an overlap."""
-    for i in range(len(battle.units)):
-        walked = battle.units[i].walked_at == now and battle.units[i].alive
-        # Everybody is near to himself.
-        if walked and _count_near(battle, i, len(battle.units), tables.rules[0].widest_contact2) > 1:
-            _separate_one(tables, battle, i, now)
+def _separate(tables, battle, i, now):
+    """Push unit i, which walked in this loop, and the discs that it overlaps apart, by unit number.
 
-
-@inlined
-def _separate_one(tables, battle, i, now):
+    Only units that walked can have made an overlap.
+    """
+    contact2 = tables.contact2[np.uint64(tables.specs[i].kind)]
+    touched = 0
+    for j in range(len(battle.units)):
+        touched += _distance2(battle, i, j) < contact2[j]
+    # Everybody touches himself.
+    if touched == 1:
+        return
     for j in range(len(battle.units)):
         distance2 = _distance2(battle, i, j)
-        if distance2 < tables.rules[0].widest_contact2 and j != i and battle.units[j].alive:
+        if distance2 < contact2[j] and j != i and battle.units[j].alive:
             both_walked = battle.units[j].walked_at == now
-            contact = tables.pairs[tables.specs[i].kind, tables.specs[j].kind].contact
-            if distance2 < contact * contact and not (both_walked and j < i):
+            if not (both_walked and j < i):
+                contact = tables.pairs[tables.specs[i].kind, tables.specs[j].kind].contact
                 _part(tables, battle, i, j, np.sqrt(distance2), contact, both_walked)
 
 

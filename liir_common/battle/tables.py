@@ -65,7 +65,7 @@ RULES = np.dtype(
     ]
     + [
         (name, np.float64)
-        for name in ("reward_divisor", "widest_scan2", "widest_contact2", "goal_span_x", "goal_span_y")
+        for name in ("reward_divisor", "widest_scan2", "goal_span_x", "goal_span_y")
     ],
     align=True,
 )  # fmt: skip
@@ -118,6 +118,8 @@ class Tables(NamedTuple):
     """[units] of SPEC"""
     pairs: NDArray[np.void]
     """[kinds, kinds] of PAIR"""
+    contact2: NDArray[np.float64]
+    """[kinds, units], the squared distance at which a unit of that kind touches that unit"""
     pathing: NDArray[np.bool_]
     """[32, 32] by (x, y), as SMAC v1 sees it"""
     layers: NDArray[np.bool_]
@@ -137,6 +139,8 @@ class Battle(NamedTuple):
     """[units]"""
     units: NDArray[np.void]
     """[units] of UNIT"""
+    walkers: NDArray[np.uint64]
+    """[units], numbers of the units that walked in this loop, in the order in which they acted"""
     status: NDArray[np.int64]
     """[7], indexed by the constants of `engine`"""
     last_actions: NDArray[np.int64]
@@ -218,11 +222,12 @@ def build_tables(scenario: Scenario, settings: Settings) -> Tables:
         _set_goals(specs[n_allies:], scenario.goal, settings)
     pairs = np.array([[_pair(a, b, settings) for b in kinds.values()] for a in kinds.values()], PAIR)
     rules = _rules(scenario, settings, units, n_allies)
-    rules["widest_scan2"], rules["widest_contact2"] = pairs["scan2"].max(), pairs["contact"].max() ** 2
+    rules["widest_scan2"] = pairs["scan2"].max()
     return Tables(
         rules=rules,
         specs=specs,
         pairs=pairs,
+        contact2=pairs["contact"].take(specs["kind"], axis=1) ** 2,
         pathing=terrain.pathing,
         layers=terrain.layers,
         height=terrain.height,
@@ -358,6 +363,7 @@ def build_battle(tables: Tables) -> Battle:
         x=np.zeros(len(tables.specs)),
         y=np.zeros(len(tables.specs)),
         units=np.zeros(len(tables.specs), UNIT),
+        walkers=np.zeros(len(tables.specs), np.uint64),
         status=np.zeros(7, np.int64),
         last_actions=np.full(n_allies, -1, np.int64),
         clock=np.zeros(1),

@@ -235,17 +235,13 @@ def _play_loop(tables, battle, upwards):
         # Unsigned, so that no index needs a test for being negative.
         i = np.uint64(k if upwards else n - 1 - k)
         if battle.units[i].alive:
-            # Without a branch: written in any case, and kept if it walks.
-            battle.walkers[walkers] = i
             walkers += _act(tables, battle, i, now, upwards)
     if tables.rules[0].has_missiles:
         _fly_missiles(tables, battle, now)
     if tables.rules[0].has_areas:
         _blast_all(tables, battle, now)
-    for k in range(walkers):
-        i = battle.walkers[k if upwards else walkers - 1 - k]
-        if battle.units[i].alive:
-            _separate(tables, battle, i, now)
+    if walkers:
+        _separate(tables, battle, now)
     battle.clock[0] = now + 1.0
 
 
@@ -626,19 +622,28 @@ def _displace(tables, battle, i, x, y):
 
 
 @inlined
-def _separate(tables, battle, i, now):
-    """Push unit i, which walked in this loop, and the discs that it overlaps apart, by unit number.
+def _separate(tables, battle, now):
+    """Push overlapping discs apart; only units that walked in this loop can have made an overlap."""
+    for i in range(len(battle.units)):
+        if battle.units[i].walked_at == now and battle.units[i].alive:
+            contact2 = tables.contact2[np.uint64(tables.specs[i].kind)]
+            # Everybody touches himself.
+            if _count_touched(battle, i, contact2) > 1:
+                _separate_one(tables, battle, i, contact2, now)
 
-    Only units that walked can have made an overlap.
-    """
-    contact2 = tables.contact2[np.uint64(tables.specs[i].kind)]
-    touched = 0
-    for j in range(len(battle.units)):
-        touched += _distance2(battle, i, j) < contact2[j]
-    # Everybody touches himself.
-    if touched == 1:
-        return
-    for j in range(len(battle.units)):
+
+@inlined
+def _count_touched(battle, i, contact2):
+    """How many units overlap i, dead or alive and i among them: a quick test, as `_count_near` is."""
+    count = 0
+    for j in range(len(contact2)):
+        count += _distance2(battle, i, j) < contact2[j]
+    return count
+
+
+@inlined
+def _separate_one(tables, battle, i, contact2, now):
+    for j in range(len(contact2)):
         distance2 = _distance2(battle, i, j)
         if distance2 < contact2[j] and j != i and battle.units[j].alive:
             both_walked = battle.units[j].walked_at == now

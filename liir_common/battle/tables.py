@@ -139,8 +139,6 @@ class Battle(NamedTuple):
     """[units]"""
     units: NDArray[np.void]
     """[units] of UNIT"""
-    walkers: NDArray[np.uint64]
-    """[units], numbers of the units that walked in this loop, in the order in which they acted"""
     status: NDArray[np.int64]
     """[7], indexed by the constants of `engine`"""
     last_actions: NDArray[np.int64]
@@ -363,7 +361,6 @@ def build_battle(tables: Tables) -> Battle:
         x=np.zeros(len(tables.specs)),
         y=np.zeros(len(tables.specs)),
         units=np.zeros(len(tables.specs), UNIT),
-        walkers=np.zeros(len(tables.specs), np.uint64),
         status=np.zeros(7, np.int64),
         last_actions=np.full(n_allies, -1, np.int64),
         clock=np.zeros(1),

@@ -34,9 +34,6 @@ browser: setup ## Install Chromium, which the tests of the replay page want
 fuzz: setup ## Damaged messages, 100 000 into the codec and 5 000 into a learner
 	$(BIN)/python -m tests.security.fuzz_wire $(ARGS)
 
-test-monitoring: setup ## Run the tests that need prometheus and promtool (apt-get install prometheus)
-	$(BIN)/pytest -m prometheus $(ARGS)
-
 # Debian's package, unpacked and not installed, since an installed one starts a server.
 PROMETHEUS := $(CURDIR)/$(VENV)/prometheus
 $(PROMETHEUS)/usr/bin/promtool:

@@ -285,7 +285,8 @@ def test_simultaneous_death_is_no_win() -> None:
     assert observation[ATTACK]
     _, rewards, terminated, _, infos = env.step({f"ally_{i}": ATTACK if i == 0 else 0 for i in range(5)})
     assert all(terminated.values())
-    assert infos["ally_0"] == {"alive": False, "won": 0.0, "dead_allies": 5.0, "dead_enemies": 5.0}
+    outcome = {key: infos["ally_0"][key] for key in ("alive", "won", "dead_allies", "dead_enemies")}
+    assert outcome == {"alive": False, "won": 0.0, "dead_allies": 5.0, "dead_enemies": 5.0}
     assert rewards["ally_0"] == pytest.approx((1 + 10) / 51), "no bonus for a win"
 
 

@@ -21,7 +21,7 @@ from grpc_reflection.v1alpha import reflection_pb2
 from liir_common import config, metrics
 from liir_common.certs import make_certs
 from liir_common.client import CheckpointClient
-from liir_common.config import PLAINTEXT, SecurityConfig
+from liir_common.config import PLAINTEXT, SecurityConfig, load
 from liir_common.errors import ConfigError, UnreachableError
 from liir_common.rpc import channel, tokens
 from liir_common.rpc.gen.liir.v1 import (
@@ -285,8 +285,9 @@ def test_client_cas_rotate_without_a_restart(tmp_path: Path, certs: Path) -> Non
             channel.connect(address, 1, new)
 
 
-def test_metrics_are_served_on_loopback_only() -> None:
-    port = metrics.serve(0, "learner.metrics_port")
+def test_metrics_are_served_on_loopback_unless_asked() -> None:
+    host = load().metrics.host
+    port = metrics.serve(metrics.LEARNER, host, 0, "learner.metrics_port")
     socket.create_connection(("127.0.0.1", port), timeout=5).close()
     with pytest.raises(ConnectionRefusedError):  # an address of this machine, too
         socket.create_connection(("127.0.0.2", port), timeout=5)

@@ -470,7 +470,7 @@ def bench_rollout_command(map_name: Map = "3m", as_json: Json = False) -> None:
 @bench.command("learner")
 def bench_learner_command(
     map_name: Map = "3m",
-    algorithm: Annotated[str, typer.Option(help="liir or central_v.")] = "liir",
+    algorithm: Annotated[str, typer.Option(help="Name of the method.")] = "liir",
     steps: Annotated[int, typer.Option(min=2, help="Mean length of the episodes.")] = 25,
     settings: options.Settings = None,
     as_json: Json = False,

@@ -16,6 +16,7 @@ from liir_common.battle.parameters import resolve
 from liir_common.battle.render import Shot
 from liir_common.battle.scenarios import make_battle
 from liir_common.battle.tables import FIRST_ATTACK
+from liir_common.battle.units import UNIT_TYPES
 from liir_common.checkpoint import Manifest
 from liir_common.config import EnvConfig
 from liir_common.errors import ConfigError
@@ -25,7 +26,7 @@ from liir_common.rollout.play import env_spec
 from liir_common.rollout.policy import MODES, Choice, act, pack
 from liir_common.types import EnvSpec, Exploration, FloatArray, IntArray, Ticket, Trajectory, Weights
 
-HEALERS = ("medivac",)
+HEALERS = frozenset(name for name, unit in UNIT_TYPES.items() if unit.weapon is None)
 """Unit types whose targets are their friends"""
 Frame = Sequence[UnitRecord]
 """All units at one moment, allies first"""

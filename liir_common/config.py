@@ -57,8 +57,8 @@ class ExplorationConfig(Section):
     """ε of the behaviour policy, lowered linearly over environment steps."""
 
     start: float = Field(0.5, ge=0, le=1)
-    end: float = Field(0.01, ge=0, le=1)
-    steps: int = Field(50_000, ge=0)
+    end: float = Field(0.05, ge=0, le=1)
+    steps: int = Field(300_000, ge=0)
 
     def epsilon(self, env_steps: int) -> float:
         """ε after `env_steps` steps of the run."""
@@ -323,6 +323,7 @@ PRESETS: Mapping[str, dict[str, Any]] = {
             "critic_epochs": 1,
             "entropy": 0.0,
             "orthogonal_init": False,
+            "exploration": {"start": 0.5, "end": 0.01, "steps": 50_000},
             "policy_optimizer": _RMSPROP,
             # ‖∇η‖ is 1e-5 to 2e-4: with the eps of the others η would hardly move.
             "eta_optimizer": _RMSPROP | {"eps": 1e-10},

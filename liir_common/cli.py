@@ -217,13 +217,15 @@ def certs(
         list[str] | None, typer.Option("--host", help="Name or address of the learner beside localhost.")
     ] = None,
 ) -> None:
-    """Make a development CA, certificates and tokens; again, renew the certificates with the same CA."""
+    """Make a development CA and each role's certificate and token; again, renew the certificates."""
     from liir_common.certs import make_certs
+    from liir_common.rpc.tokens import Role
 
     make_certs(output, hosts or ())
-    print(f"security: {{ca: {output}/ca.pem, client_ca: {output}/ca.pem, tokens: {output}/tokens,")
-    print(f"           cert: {output}/server.pem, key: {output}/server-key.pem}}")
-    print(f"# clients elsewhere: {output}/client.pem and -key.pem, and only their role's line of the tokens")
+    print(f"security: {output}/learner")
+    print(
+        f"# clients elsewhere have the folder of their role: {', '.join(f'{output}/{role}' for role in Role)}"
+    )
 
 
 @app.command()

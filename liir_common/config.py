@@ -226,7 +226,10 @@ FilePath = Annotated[str, AfterValidator(_absolute)]
 
 
 class SecurityConfig(Section):
-    """TLS and tokens of this process. It names files: no secret is ever part of a configuration."""
+    """TLS and tokens of this process. It names files: no secret is ever part of a configuration.
+
+    A string in the place of the section is a folder that holds them all, as `liir certs` makes one per role.
+    """
 
     ca: FilePath = ""
     """Client: CA certificates (PEM) that the learner's must come from; empty speaks plaintext."""
@@ -412,12 +415,29 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _spelled_out(tree: dict[str, Any]) -> dict[str, Any]:
-    """`algorithm: qmix` is short for `algorithm: {name: qmix}`, and `env: smac` for `env: {kind: smac}`."""
+    """`algorithm: qmix` is short for `algorithm: {name: qmix}`, and `env: smac` for `env: {kind: smac}`.
+
+    `security: FOLDER` is short for the names of the files that `liir certs` put there.
+    """
     short = {"algorithm": "name", "env": "kind"}
-    return {
+    spelled = {
         key: {short[key]: value} if key in short and isinstance(value, str) else value
         for key, value in tree.items()
     }
+    if isinstance(folder := tree.get("security"), str):
+        spelled["security"] = _files_of_role(Path(folder).expanduser())
+    return spelled
+
+
+def _files_of_role(folder: Path) -> dict[str, str]:
+    if not folder.is_dir():
+        # Not quoted: somebody may have written a token there.
+        raise ConfigError(
+            "security: wanted the folder of a role, as `liir certs` makes it, or a section with names of "
+            "files; got the name of no folder"
+        )
+    files = {"ca": "ca.pem", "client_ca": "ca.pem", "cert": "cert.pem", "key": "key.pem", "tokens": "tokens"}
+    return {key: str(folder / name) for key, name in files.items()}
 
 
 def _named(data: Mapping[str, Any], section: str, key: str) -> str:

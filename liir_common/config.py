@@ -228,7 +228,7 @@ FilePath = Annotated[str, AfterValidator(_absolute)]
 class SecurityConfig(Section):
     """TLS and tokens of this process. It names files: no secret is ever part of a configuration.
 
-    A string in the place of the section is a folder that holds them all, as `liir certs` makes one per role.
+    The name of a folder that holds them all, as `liir certs` makes one per role, may stand for the section.
     """
 
     ca: FilePath = ""
@@ -241,6 +241,15 @@ class SecurityConfig(Section):
     """Learner: CA certificates (PEM) that every client's must come from; empty asks for none."""
     tokens: FilePath = ""
     """Lines `ROLE TOKEN [EXPIRES]`; the variable LIIR_TOKENS may hold them instead."""
+
+    @classmethod
+    def of(cls, folder: str | Path) -> Self:
+        """The files of a role's folder.
+
+        Raises:
+            ConfigError: there is no such folder.
+        """
+        return cls(**_files_of_role(folder))
 
     @model_validator(mode="after")
     def _check_pairs(self) -> Self:
@@ -425,19 +434,20 @@ def _spelled_out(tree: dict[str, Any]) -> dict[str, Any]:
         for key, value in tree.items()
     }
     if isinstance(folder := tree.get("security"), str):
-        spelled["security"] = _files_of_role(Path(folder).expanduser())
+        spelled["security"] = _files_of_role(folder)
     return spelled
 
 
-def _files_of_role(folder: Path) -> dict[str, str]:
-    if not folder.is_dir():
+def _files_of_role(folder: str | Path) -> dict[str, str]:
+    path = Path(folder).expanduser()
+    if not path.is_dir():
         # Not quoted: somebody may have written a token there.
         raise ConfigError(
             "security: wanted the folder of a role, as `liir certs` makes it, or a section with names of "
             "files; got the name of no folder"
         )
     files = {"ca": "ca.pem", "client_ca": "ca.pem", "cert": "cert.pem", "key": "key.pem", "tokens": "tokens"}
-    return {key: str(folder / name) for key, name in files.items()}
+    return {key: str(path / name) for key, name in files.items()}
 
 
 def _named(data: Mapping[str, Any], section: str, key: str) -> str:

@@ -119,8 +119,7 @@ def ask_over(connection: grpc.Channel, method: str, metadata: Any = None) -> tup
 def test_each_role_reaches_its_methods_and_no_other(
     learner: str, certs: Path, index: int, role: Role
 ) -> None:
-    own = load(None, [f"security={certs / role}"]).security
-    with channel.connect(learner, 10, own, role) as connection:
+    with channel.connect(learner, 10, SecurityConfig.of(certs / role), role) as connection:
         for method, access in ACCESS.items():
             code, details = ask_over(connection, method)
             if access[index] == "x":
@@ -174,13 +173,11 @@ def test_the_wrong_certificates_are_explained(learner: str, certs: Path, tmp_pat
     folder = tmp_path / "certs"
     shutil.copytree(certs, folder)
     make_certs(folder / "other")
+    pair = {"cert": "other/reader/cert.pem", "key": "other/reader/key.pem"}
     wrong = {
         "another CA": ({"ca": "other/ca.pem"}, "CERTIFICATE_VERIFY_FAILED"),
         "no client certificate": ({"cert": "", "key": "", "client_ca": ""}, "security.ca"),
-        "one of another CA": (
-            {"cert": "other/reader/cert.pem", "key": "other/reader/key.pem"},
-            "security.ca",
-        ),
+        "one of another CA": (pair, "security.ca"),
         "plaintext": (None, "security.ca"),
     }
     for case, (files, message) in wrong.items():

@@ -18,6 +18,7 @@ from pydantic_settings import (
     InitSettingsSource,
     PydanticBaseSettingsSource,
     SettingsConfigDict,
+    SettingsError,
 )
 
 from liir_common.errors import ConfigError
@@ -395,6 +396,10 @@ def load(path: Path | None = None, settings: Sequence[str] = ()) -> Config:
         return Config(**sources)
     except ValidationError as error:
         raise ConfigError(_explain(error)) from None
+    except SettingsError as error:
+        raise ConfigError(
+            f"the environment has a section that is not JSON ({error}); set its keys, as in LIIR_ENV__MAP=8m"
+        ) from None
 
 
 def from_tree(tree: Mapping[str, Any]) -> Config:

@@ -174,3 +174,11 @@ def test_a_kept_tree_is_all_there_is(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("LIIR_TRAINING__LAG", "1")
     assert config.from_tree({"seed": 2}).training.lag == 0
     assert config.load().training.lag == 1
+
+
+def test_a_section_in_the_environment_is_json_or_its_keys(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("LIIR_ENV", '{"map": "8m"}')
+    assert config.load().env.map == "8m"
+    monkeypatch.setenv("LIIR_ENV", "8m")
+    with pytest.raises(ConfigError, match=r'not JSON \(.*"env".*; set its keys, as in LIIR_ENV__MAP'):
+        config.load()

@@ -148,10 +148,23 @@ class AlgorithmConfig(Section):
     """Hidden units of the networks that make the mixer's weights."""
 
     @property
+    def value_based(self) -> bool:
+        """Whether the policy's outputs are Q values, of which a softmax means nothing."""
+        return self.name in ("iql", "vdn", "qmix")
+
+    @property
     def behaviour(self) -> Exploration:
         """How actors choose actions."""
-        value_based = self.name in ("iql", "vdn", "qmix")
-        return Exploration.EPSILON_GREEDY if value_based else Exploration.SOFTMAX_FLOOR
+        return Exploration.EPSILON_GREEDY if self.value_based else Exploration.SOFTMAX_FLOOR
+
+    def frozen_choice(self, sampled: bool) -> tuple[Exploration, float]:
+        """How a frozen policy chooses, and its epsilon: the best action, or if `sampled` as it was trained.
+
+        Then it draws from the policy; where values are learned, ε-greedy with the ε at which training ends.
+        """
+        if not sampled:
+            return Exploration.GREEDY, 0.0
+        return self.behaviour, self.exploration.end if self.value_based else 0.0
 
     @model_validator(mode="after")
     def _coma_sees_actions(self) -> Self:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import re
 import socket
 import threading
 from collections.abc import AsyncIterator, Callable, Iterator
@@ -28,6 +29,7 @@ from liir_common.rpc.server import Server
 from services.learner.checkpoint_service import CheckpointService
 from services.learner.run_directory import RunDirectory
 
+API = Path(__file__).parents[2] / "docs" / "api.md"
 HIDDEN = 96
 """Wide enough for a file of several chunks."""
 CHUNK = 64 * 1024
@@ -200,6 +202,17 @@ def test_what_another_run_left_is_replaced(store: Store, tmp_path: Path) -> None
     with other.served() as address, CheckpointClient(address) as client:
         assert client.save(200, tmp_path / "got").read_bytes() == other.data != store.data
     Policy.load(tmp_path / "got" / "checkpoint-000000200.safetensors")
+
+
+def test_the_documented_client_works(store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    blocks = re.findall(r"^```python\n(.*?)^```$", API.read_text(), re.DOTALL | re.MULTILINE)
+    (code,) = (block for block in blocks if "a learner runs at ADDRESS" in block)
+    monkeypatch.chdir(tmp_path)
+    with store.served() as address:
+        scope: dict[str, Any] = {"ADDRESS": address}
+        exec(code, scope)
+    assert scope["path"].read_bytes() == store.data
+    assert scope["policy"].manifest == Policy.load(scope["path"]).manifest
 
 
 def half(path: Path) -> None:

@@ -17,6 +17,7 @@ from liir_common.battle.env import parallel_env
 from liir_common.checkpoint import Manifest
 from liir_common.config import EnvConfig
 from liir_common.errors import CorruptError
+from liir_common.export import to_onnx
 from liir_common.policy import Policy
 from liir_common.pursuit import Pursuit
 from liir_common.replay import load
@@ -28,13 +29,18 @@ from liir_common.types import Exploration, Ticket
 from tests.replays import HIDDEN, publish
 from tests.unit.test_rollout_loop import Leaving
 
-README = (Path(__file__).parents[2] / "README.md").read_text()
+ROOT = Path(__file__).parents[2]
+README, API = (ROOT / "README.md").read_text(), (ROOT / "docs" / "api.md").read_text()
 CHOICES = {
     ("liir", False): (Exploration.GREEDY, 0.0),
     ("liir", True): (Exploration.SOFTMAX_FLOOR, 0.0),
     ("qmix", False): (Exploration.GREEDY, 0.0),
     ("qmix", True): (Exploration.EPSILON_GREEDY, 0.05),
 }
+
+
+def python_blocks(text: str) -> list[str]:
+    return re.findall(r"^```python\n(.*?)^```$", text, re.DOTALL | re.MULTILINE)
 
 
 def taken(policy: Policy, env: Any, seed: int) -> list[dict[str, int]]:
@@ -157,14 +163,21 @@ def test_another_simulator_is_warned_of(tmp_path: Path, monkeypatch: pytest.Monk
 def test_the_readme_plays_a_policy(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (code,) = (
-        block
-        for block in re.findall(r"^```python\n(.*?)^```$", README, re.S | re.M)
-        if "Policy.load" in block
-    )
+    (code,) = (block for block in python_blocks(README) if "Policy.load" in block)
     path = publish(tmp_path, 1000, "3m")
     (tmp_path / "checkpoints").rename(tmp_path / "here")
     assert f"here/{path.name}" in code
     monkeypatch.chdir(tmp_path)
     exec(code, {})
     assert len(capsys.readouterr().out.splitlines()) > 5
+
+
+@pytest.mark.parametrize("name", ["CHECKPOINT is a file", "CHECKPOINT.onnx was exported"])
+def test_the_loops_of_the_documents_play_a_whole_battle(tmp_path: Path, name: str) -> None:
+    (code,) = (block for block in python_blocks(API) if name in block)
+    path = publish(tmp_path, map_name="3m")
+    Path(f"{path}.onnx").write_bytes(to_onnx(*load_checkpoint(path)))
+    scope: dict[str, Any] = {"CHECKPOINT": path}
+    exec(code, scope)
+    assert not scope["env"].agents
+    assert "won" in scope["infos"]["ally_0"]

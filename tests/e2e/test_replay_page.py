@@ -185,3 +185,16 @@ def test_a_page_without_intrinsic_reward_says_so(browser: Browser, tmp_path: Pat
     expect(visit.page.locator("#actions th")).to_have_text(["action", "probability"])
     assert visit.complaints == []
     visit.page.close()
+
+
+def test_a_value_based_method_shows_q_values(browser: Browser, tmp_path: Path) -> None:
+    recording = record(*load_checkpoint(publish(tmp_path, method="iql")))
+    assert recording.q_values is not None
+    write(recording, tmp_path / "battle.html")
+    visit = Visit(browser, tmp_path / "battle.html")
+    expect(visit.page.locator("#actions th")).to_have_text(["action", "Q value"])
+    taken = recording.q_values[0, 0, recording.trajectory.actions[0, 0]]
+    expect(visit.page.locator("#actions tr.taken")).to_contain_text(f"{taken:.3f}")
+    assert "%" not in visit.page.locator("#actions").inner_text()
+    assert visit.complaints == []
+    visit.page.close()

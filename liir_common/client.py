@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import re
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -111,9 +112,12 @@ class CheckpointClient:
         What was cut, this process included, goes on where it was cut. A checkpoint is there when its
         manifest is, which is written last. Raises what `download` raises.
         """
+        digest = self.find(episode).sha256
+        if not re.fullmatch("[0-9a-f]{64}", digest):
+            raise CorruptError(f"checkpoint {episode}: wanted a SHA-256 in hex, got {digest!r}")
         folder.mkdir(parents=True, exist_ok=True)
         # Named by the digest: what another checkpoint of that name left is never gone on with.
-        part = folder / f".{self.find(episode).sha256}.part"
+        part = folder / f".{digest}.part"
         with part.open("ab") as file:
             manifest = self._fetch(episode, file)
             file.flush()

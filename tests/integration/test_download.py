@@ -9,7 +9,7 @@ import socket
 import threading
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -54,11 +54,11 @@ class Store:
     def __init__(self, path: Path) -> None:
         self.run_dir = path
         run_config = config.load(settings=["env.map=3m", f"algorithm.policy_hidden={HIDDEN}"])
-        self._run = RunDirectory(path, run_config, env_spec(run_config.env))
+        self.run = RunDirectory(path, run_config, env_spec(run_config.env))
         self.publish(100, seed=1)
 
     def publish(self, episode: int, seed: int) -> None:
-        spec = self._run.spec
+        spec = self.run.spec
         tensors = {f"policy.{name}": a for name, a in random_weights(spec, HIDDEN, seed).items()}
         self.data = checkpoint.pack(tensors)
         self.manifest = Manifest(
@@ -68,12 +68,12 @@ class Store:
             run_id="run",
             git_commit="abc",
             env_spec=asdict(spec),
-            config=self._run.config.tree(),
+            config=self.run.config.tree(),
             created=1.0,
             sha256=sha256(self.data).hexdigest(),
             size_bytes=len(self.data),
         )
-        self._run.checkpoints.publish(self.manifest, self.data)
+        self.run.checkpoints.publish(self.manifest, self.data)
 
     @contextmanager
     def served(self) -> Iterator[str]:
@@ -83,7 +83,7 @@ class Store:
 
         async def serve() -> None:
             server, ended = Server("127.0.0.1", 0, PLAINTEXT), asyncio.Event()
-            self.service = Counted(self._run)
+            self.service = Counted(self.run)
             checkpoint_pb2_grpc.add_CheckpointServiceServicer_to_server(self.service, server.grpc)
             await server.start()
             started.update(port=server.port, end=ended.set, loop=asyncio.get_running_loop())
@@ -213,6 +213,19 @@ def test_the_documented_client_works(store: Store, tmp_path: Path, monkeypatch: 
         exec(code, scope)
     assert scope["path"].read_bytes() == store.data
     assert scope["policy"].manifest == Policy.load(scope["path"]).manifest
+
+
+def test_a_digest_names_no_other_folder(store: Store, tmp_path: Path) -> None:
+    store.publish(200, seed=2)
+    manifests = store.run.checkpoints.manifests
+    manifests[1] = replace(manifests[1], sha256="/../../evil")
+    with (
+        store.served() as address,
+        CheckpointClient(address) as client,
+        pytest.raises(CorruptError, match=r"wanted a SHA-256 in hex, got '/\.\./\.\./evil'"),
+    ):
+        client.save(200, tmp_path / "got")
+    assert not list(tmp_path.rglob("*evil*"))
 
 
 def half(path: Path) -> None:

@@ -32,6 +32,7 @@ class Policy:
         weights, spec = checkpoint.section(tensors, "policy"), manifest.spec
         algorithm = AlgorithmConfig.model_validate(manifest.config["algorithm"])
         self.manifest = manifest
+        self._env: Env | None = None
         self._sizes = (spec.n_agents, spec.obs_dim, spec.n_actions)
         self._exploration, self._epsilon = algorithm.frozen_choice(sampled)
         self._network = pack(weights, spec, algorithm.policy_hidden)
@@ -80,10 +81,13 @@ class Policy:
         """The next action of every agent in `env.agents`, from what `env.reset` or `env.step` returned.
 
         Raises:
-            ValueError: an observation is not finite, or an agent has no available action.
+            ValueError: no episode was begun, or an agent has no finite observation or no available action.
         """
+        if self._env is None:
+            raise ValueError("act wants an episode: call begin(env) before its first step")
+        present = self._env.agents
         for i, agent in enumerate(self._env.possible_agents):
-            if agent in self._env.agents:
+            if agent in present:
                 self._obs[i], self._mask[i] = read_observation(observations[agent], infos[agent])
             else:
                 self._obs[i], self._mask[i] = 0, np.arange(self._mask.shape[1]) == NO_OP
@@ -100,7 +104,7 @@ class Policy:
         )
         self._step += 1
         actions = dict(zip(self._env.possible_agents, self._chosen.tolist(), strict=True))
-        return {agent: actions[agent] for agent in self._env.agents}
+        return {agent: actions[agent] for agent in present}
 
     def play(self, env: Env, seed: int | None = None) -> Iterator[tuple[Any, ...]]:
         """Play one episode; after every step comes what `env.step` returned. Raises what the others raise."""

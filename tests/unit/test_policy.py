@@ -132,8 +132,10 @@ def test_another_size_is_refused() -> None:
 def test_what_cannot_be_decided_on_is_refused(value: float, message: str) -> None:
     env = parallel_env("3m")
     policy = Policy(*frozen(env))
-    policy.begin(env, 1)
     observations, infos = env.reset(seed=1)
+    with pytest.raises(ValueError, match="call begin"):
+        policy.act(observations, infos)
+    policy.begin(env, 1)
     observations["ally_0"]["observation"][3] = value
     observations["ally_0"]["action_mask"][:] = 0 if value == 0 else 1
     with pytest.raises(ValueError, match=f"step 0: .*{message}"):

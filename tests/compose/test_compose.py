@@ -84,12 +84,12 @@ class Compose:
         """Run `docker compose ARGUMENTS`; returns its output."""
         return self.run(["docker", "compose", *arguments])
 
-    def documented(self, heading: str, code: int = 0) -> str:
+    def documented(self, heading: str) -> None:
         """Run the commands below a heading of docs/operations.md as a user would, on this test's learner."""
         block = re.search(rf"### {heading}\n.*?```\n(.*?)```", DOCUMENT.read_text(), re.DOTALL)
         assert block, heading
         commands = block[1].replace("127.0.0.1:50051", LEARNER).replace(" 1000 ", f" {EPISODE} ")
-        return self.run(["sh", "-ec", commands], code)
+        self.run(["sh", "-ec", commands])
 
     def liir(self, *command: str, code: int = 0) -> str:
         """Run a `liir` command against the learner with the reader's folder that was last fetched."""

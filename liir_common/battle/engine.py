@@ -279,9 +279,10 @@ def _acquire(tables, battle, i, now, upwards):
     """
     units, unit, kind, rules = battle.units, battle.units[i], tables.specs[i].kind, tables.rules[0]
     if unit.target >= 0:
-        if units[unit.target].alive:
-            distance2 = _distance2(battle, i, unit.target)
-            if distance2 <= tables.pairs[kind, tables.specs[unit.target].kind].hold2:
+        target = np.uint64(unit.target)
+        if units[target].alive:
+            distance2 = _distance2(battle, i, target)
+            if distance2 <= tables.pairs[kind, tables.specs[target].kind].hold2:
                 return
             if rules.chase_attacker and unit.target == unit.attacker and distance2 <= CHASE_LIMIT**2:
                 return
@@ -292,7 +293,7 @@ def _acquire(tables, battle, i, now, upwards):
         return
     nearest2 = np.inf
     for k in range(rules.n_allies):
-        j = k if upwards else rules.n_allies - 1 - k
+        j = np.uint64(k if upwards else rules.n_allies - 1 - k)
         if units[j].alive:
             distance2 = _distance2(battle, i, j)
             if distance2 < nearest2 and distance2 <= tables.pairs[kind, tables.specs[j].kind].scan2:
@@ -324,18 +325,19 @@ def _attack(tables, battle, i, now):
     Whether it walks.
     """
     unit, spec = battle.units[i], tables.specs[i]
-    if not battle.units[unit.target].alive:
+    target = np.uint64(unit.target)
+    if not battle.units[target].alive:
         _rest(tables.rules[0], battle, i)
         return False
-    x, y = battle.x[unit.target] - battle.x[i], battle.y[unit.target] - battle.y[i]
-    if x * x + y * y > tables.pairs[spec.kind, tables.specs[unit.target].kind].reach2:
+    x, y = battle.x[target] - battle.x[i], battle.y[target] - battle.y[i]
+    if x * x + y * y > tables.pairs[spec.kind, tables.specs[target].kind].reach2:
         return _walk(tables, battle, i, x, y, now)
     if now >= unit.ready_at:
         if tables.rules[0].has_areas:
             if spec.blast > 0.0:
                 _die(tables, battle, i)
                 return False
-            unit.missile_x, unit.missile_y = battle.x[unit.target], battle.y[unit.target]
+            unit.missile_x, unit.missile_y = battle.x[target], battle.y[target]
         delay = rng.uniform(battle.stream)
         if tables.rules[0].integer_delay:
             delay = np.floor(delay * (_DELAY_SPAN + 1.0)) / _DELAY_SPAN
@@ -614,11 +616,17 @@ def _around(tables, battle, i, x, y):
 @inlined
 def _displace(tables, battle, i, x, y):
     """Move a unit, axis by axis, as far as the ground allows; so units slide along walls."""
-    cells = tables.layers[np.uint64(tables.specs[i].layer)]
-    if cells[int(battle.x[i] + x), int(battle.y[i])]:
+    cells = tables.layers[tables.specs[i].layer]
+    if cells[_cell(battle.x[i] + x), _cell(battle.y[i])]:
         battle.x[i] += x
-    if cells[int(battle.x[i]), int(battle.y[i] + y)]:
+    if cells[_cell(battle.x[i]), _cell(battle.y[i] + y)]:
         battle.y[i] += y
+
+
+@inlined
+def _cell(position):
+    """The cell of a position along one axis; the map's size is a power of two, so masking keeps within it."""
+    return np.uint32(np.int64(position) & (MAP_SIZE - 1))
 
 
 @inlined
@@ -626,7 +634,7 @@ def _separate(tables, battle, now):
     """Push overlapping discs apart; only units that walked in this loop can have made an overlap."""
     for i in range(len(battle.units)):
         if battle.units[i].walked_at == now and battle.units[i].alive:
-            contact2 = tables.contact2[np.uint64(tables.specs[i].kind)]
+            contact2 = tables.contact2[tables.specs[i].kind]
             # Everybody touches himself.
             if _count_touched(battle, i, contact2) > 1:
                 _separate_one(tables, battle, i, contact2, now)

@@ -115,13 +115,12 @@ def _act_randomly(mask, stream, actions):
         available = 0
         for a in range(mask.shape[1]):
             available += mask[i, a]
-        skip = np.int64(rng.uniform(stream) * available)
+        skip, passed, action = np.int64(rng.uniform(stream) * available), 0, 0
+        # Without branches, which the processor would guess wrongly.
         for a in range(mask.shape[1]):
-            if mask[i, a]:
-                if skip == 0:
-                    actions[i] = a
-                    break
-                skip -= 1
+            passed += mask[i, a]
+            action += passed <= skip
+        actions[i] = action
 
 
 @inlined

@@ -73,7 +73,8 @@ RULES = np.dtype(
 map lacks out of its loops."""
 
 SPEC = np.dtype(
-    [(name, np.int64) for name in ("kind", "type_bit", "hits", "beams", "layer", "heals", "biological")]
+    [(name, np.uint32) for name in ("kind", "layer")]
+    + [(name, np.int64) for name in ("type_bit", "hits", "beams", "heals", "biological")]
     + [
         (name, np.float64)
         for name in (
@@ -84,7 +85,8 @@ SPEC = np.dtype(
     ],
     align=True,
 )  # fmt: skip
-"""What does not change about a unit; speeds per loop."""
+"""What does not change about a unit; speeds per loop. Row numbers are unsigned, because a signed index costs
+a test for being negative."""
 
 _UNARMED = Weapon(damage=0, range=0, scan_range=0, period=0, damage_point=0, backswing=0, hits=0)
 
@@ -238,6 +240,7 @@ def _spec(unit: UnitType, kind: int, type_bit: int, spawn: NDArray[np.float64]) 
     weapon = unit.weapon or _UNARMED
     values = {
         "kind": kind,
+        "layer": unit.layer,
         "type_bit": type_bit,
         "hits": weapon.hits,
         "health": unit.health,
@@ -260,7 +263,6 @@ def _spec(unit: UnitType, kind: int, type_bit: int, spawn: NDArray[np.float64]) 
         "goal_y": spawn[1],
         "beams": weapon.beams,
         "blast": weapon.blast,
-        "layer": unit.layer,
         "heals": unit.weapon is None,
         "biological": "biological" in unit.attributes,
         "energy": ENERGY_START if unit.weapon is None else 0.0,

@@ -1,0 +1,121 @@
+"""`liir train` on a Ray cluster: the learner on a GPU if there is one, the actors on every node."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import ray
+import yaml
+
+from liir_common import launch, logs, options
+from liir_common.certs import make_certs
+from liir_common.config import PLAINTEXT, ActorsConfig, SecurityConfig
+from liir_common.errors import LiirError, exit_on_error
+from liir_common.rpc import carry
+from liir_common.rpc.tokens import Role
+from services.actor.driver import start_ray
+from services.cluster.host import RemoteService
+
+_ANYWHERE = {"num_cpus": 0.001, "scheduling_strategy": "SPREAD"}
+"""As an actor: of nodes with CPUs, some node."""
+
+
+def train(
+    config: options.ConfigFile = None,
+    settings: options.Settings = None,
+    run_dir: options.RunDir = None,
+    resume: options.Resume = False,
+) -> None:
+    """Train on the Ray cluster that this machine is the head of."""
+    logs.configure("train")
+    with exit_on_error():
+        start_ray(ActorsConfig(ray_address="auto"))
+        launch.train(on_cluster, config, settings or (), run_dir, resume)
+
+
+def on_cluster(request: launch.Request) -> launch.Launcher:
+    """A launcher of processes all over the cluster; this one must be joined already.
+
+    Raises:
+        LiirError: the run to resume is on a node that is not there.
+        ConfigError: certificates cannot be made, or a file of `security` cannot be read.
+    """
+    run_dir = request.run_dir.absolute()
+    nodes = {node["NodeManagerAddress"]: node["Resources"] for node in ray.nodes() if node["Alive"]}
+    learner = Learner(request, run_dir, learners_place(request, nodes))
+    address = learner.settle()
+    security = options.load_security(request.file, list(request.settings))
+    server = client = security
+    if security == PLAINTEXT and not request.config.learner.insecure:
+        server, client = make_security(Path("certs", run_dir.name).absolute(), address)
+    learner.arguments += ["--set", f"learner.host={address}"]
+    learner.files = carry.pack(server)
+    evaluator = RemoteService("evaluator", [], run_dir, _ANYWHERE)
+    evaluator.files = carry.pack(client, Role.EVALUATOR)
+    ray_settings = ["--set", "actors.ray_address=auto", "--set", "actors.send_security=true"]
+    actors = launch.LocalService("actor", [*launch.as_settings(client), *ray_settings], run_dir, "actors")
+    return launch.Launcher(run_dir, learner, actors, evaluator, client)
+
+
+class Learner(RemoteService):
+    """The learner, whose run directory can be looked into and resumed from here."""
+
+    def __init__(self, request: launch.Request, run_dir: Path, place: Mapping[str, Any]) -> None:
+        """Prepare what was asked for, on a node that fits `place`."""
+        arguments = ["--run-dir", str(run_dir), *(["--resume"] if request.resume else [])]
+        arguments += [part for setting in request.settings for part in ("--set", setting)]
+        # With what the environment here says; the names of files here mean nothing there.
+        tree = b"" if request.resume else yaml.safe_dump(request.config.shared_tree()).encode()
+        super().__init__("learner", arguments, run_dir, place, tree)
+
+    def address(self) -> str | None:
+        """Where it serves, once it does; by then the run says so here, too."""
+        address = super().address()
+        if address:
+            self.fetch("*.*")
+        return address
+
+
+def learners_place(request: launch.Request, nodes: Mapping[str, Mapping[str, float]]) -> dict[str, Any]:
+    """Options of the Ray actor that holds the learner; `nodes` are resources by address.
+
+    A new run takes a GPU, or else the head; a resumed one goes where its directory is.
+
+    Raises:
+        LiirError: that node is not there.
+    """
+    if request.resume:
+        address, _, _ = json.loads((request.run_dir / "endpoints.json").read_text())["address"].rpartition(
+            ":"
+        )
+        if address not in nodes:
+            raise LiirError(
+                f"{request.run_dir} is on the disk of {address}, which is not in the cluster; bring it back, "
+                f"there is {', '.join(nodes)}"
+            )
+        gpus = min(1, nodes[address].get("GPU", 0))
+        return {"num_cpus": 0, "num_gpus": gpus, "resources": {f"node:{address}": 0.001}}
+    if request.config.learner.device != "cpu" and any(node.get("GPU") for node in nodes.values()):
+        return {"num_cpus": 0, "num_gpus": 1}
+    return {"num_cpus": 0, "resources": {"node:__internal_head__": 0.001}}
+
+
+def make_security(folder: Path, address: str) -> tuple[SecurityConfig, SecurityConfig]:
+    """Make or renew certificates and tokens in `folder`: the section of the learner, and of its clients."""
+    make_certs(folder, [address])
+    ca, tokens = str(folder / "ca.pem"), str(folder / "tokens")
+    pairs = {
+        name: {"cert": str(folder / f"{name}.pem"), "key": str(folder / f"{name}-key.pem")}
+        for name in ("server", "client")
+    }
+    return (
+        SecurityConfig(client_ca=ca, tokens=tokens, **pairs["server"]),
+        SecurityConfig(ca=ca, tokens=tokens, **pairs["client"]),
+    )
+
+
+if __name__ == "__main__":
+    options.run(train)

@@ -28,9 +28,11 @@ def train(
     settings: options.Settings = None,
     run_dir: options.RunDir = None,
     resume: options.Resume = False,
+    resume_if_begun: options.ResumeIfBegun = False,
 ) -> None:
     """Train on the Ray cluster that this machine is the head of."""
     logs.configure("train")
+    resume = resume or (resume_if_begun and run_dir is not None and options.holds_run(run_dir))
     with exit_on_error():
         start_ray(ActorsConfig(ray_address="auto"))
         launch.train(on_cluster, config, settings or (), run_dir, resume)
@@ -82,25 +84,31 @@ class Learner(RemoteService):
 def learners_place(request: launch.Request, nodes: Mapping[str, Mapping[str, float]]) -> dict[str, Any]:
     """Options of the Ray actor that holds the learner; `nodes` are resources by address.
 
-    A new run takes a GPU, or else the head; a resumed one goes where its directory is.
+    A new run takes a GPU, or else the head. A resumed one goes where its directory is, which is also the head
+    if the directory was brought there, or the head has another address now.
 
     Raises:
-        LiirError: that node is not there.
+        LiirError: the directory is on a node that is not there.
     """
     if request.resume:
-        address, _, _ = json.loads((request.run_dir / "endpoints.json").read_text())["address"].rpartition(
-            ":"
-        )
-        if address not in nodes:
+        endpoints = json.loads((request.run_dir / "endpoints.json").read_text())
+        address = endpoints["address"].rpartition(":")[0]
+        if address in nodes:
+            return _on(f"node:{address}", nodes)
+        if not list((request.run_dir / "state").glob("*.safetensors")):
             raise LiirError(
-                f"{request.run_dir} is on the disk of {address}, which is not in the cluster; bring it back, "
-                f"there is {', '.join(nodes)}"
+                f"{request.run_dir} is on the disk of {address}, and only {', '.join(nodes)} are in the "
+                "cluster; bring it back, or copy the run directory to the head"
             )
-        gpus = min(1, nodes[address].get("GPU", 0))
-        return {"num_cpus": 0, "num_gpus": gpus, "resources": {f"node:{address}": 0.001}}
-    if request.config.learner.device != "cpu" and any(node.get("GPU") for node in nodes.values()):
+    elif request.config.learner.device != "cpu" and any(node.get("GPU") for node in nodes.values()):
         return {"num_cpus": 0, "num_gpus": 1}
-    return {"num_cpus": 0, "resources": {"node:__internal_head__": 0.001}}
+    return _on("node:__internal_head__", nodes)
+
+
+def _on(resource: str, nodes: Mapping[str, Mapping[str, float]]) -> dict[str, Any]:
+    """Options for the node that has this resource, with a GPU of it if there is one."""
+    gpus = next((node.get("GPU", 0) for node in nodes.values() if resource in node), 0)
+    return {"num_cpus": 0, "num_gpus": min(1, gpus), "resources": {resource: 0.001}}
 
 
 def make_security(folder: Path, address: str) -> tuple[SecurityConfig, SecurityConfig]:

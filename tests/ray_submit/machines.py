@@ -68,6 +68,8 @@ class Machine:
         self._ip(f"address add {self.address}/24 dev {device}")
         self._ip(f"link set {device} up")
         self._ip("link set lo up")
+        if switch is not None:  # leads nowhere, but Ray takes the address that it would leave by
+            self._ip(f"route add default via {switch.address}")
 
     def lose(self) -> None:
         """Pull the plug: every process is gone at once; the disk stays."""
@@ -85,6 +87,7 @@ class Machine:
         with output.open("wb") as file:
             return subprocess.Popen(
                 [*enter, "bash", "-c", f"cd; {command}"],
+                cwd="/",
                 env=ENVIRONMENT,
                 stdin=subprocess.DEVNULL,
                 stdout=file,

@@ -47,6 +47,9 @@ test-monitoring: setup $(or $(shell command -v promtool),$(PROMETHEUS)/usr/bin/p
 test-compose: setup ## Run docker-compose.yml through deaths, stops and resumes; needs docker
 	$(BIN)/pytest -m compose $(ARGS)
 
+test-ray-submit: setup ## Run ray up, submit and down on three isolated machines; needs root, sshd, rsync and ip
+	$(BIN)/pytest -m ray_submit $(ARGS)
+
 dashboard: setup ## Write the Grafana dashboard from its program
 	$(BIN)/python deploy/grafana/dashboard.py > deploy/grafana/dashboards/liir.json
 
@@ -70,4 +73,4 @@ proto: setup ## Generate the gRPC code from proto/
 proto-check: proto
 	git diff --exit-code -- $(GEN)
 
-.PHONY: help setup train test browser fuzz test-monitoring test-compose dashboard lint proto proto-check
+.PHONY: help setup train test browser fuzz test-monitoring test-compose test-ray-submit dashboard lint proto proto-check

@@ -82,12 +82,11 @@ class Machine:
     def start(self, command: str, output: Path) -> subprocess.Popen[bytes]:
         """Start a shell's command in root's home; stdout and stderr go to the file."""
         (first,) = self._first_process()
-        namespaces = ["--mount", "--pid", "--net", "--ipc", "--uts", "--root"]
+        namespaces = ["--mount", "--pid", "--net", "--ipc", "--uts", "--root", "--wd"]
         enter = ["nsenter", "--target", str(first.pid), *namespaces]
         with output.open("wb") as file:
             return subprocess.Popen(
                 [*enter, "bash", "-c", f"cd; {command}"],
-                cwd="/",
                 env=ENVIRONMENT,
                 stdin=subprocess.DEVNULL,
                 stdout=file,

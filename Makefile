@@ -10,9 +10,12 @@ help: ## Show this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 18
 
 # Stamped, so that set-up costs nothing once the pinned requirements are in.
-$(VENV)/.installed: requirements.txt requirements-dev.txt pyproject.toml
+$(VENV)/.installed: requirements.txt requirements-torch.txt requirements-dev.txt pyproject.toml
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet -r requirements.txt -r requirements-dev.txt
+	$(BIN)/pip install --quiet --require-hashes -r requirements.txt
+	$(BIN)/pip install --quiet -r requirements-torch.txt
+	# What comes as source is built with the setuptools just installed, not with one that nobody checked.
+	$(BIN)/pip install --quiet --require-hashes --no-build-isolation -r requirements-dev.txt
 	$(BIN)/pip install --quiet --no-deps --no-build-isolation -e .
 	touch $@
 
@@ -53,6 +56,13 @@ test-ray-submit: setup ## Run ray up, submit and down on three isolated machines
 dashboard: setup ## Write the Grafana dashboard from its program
 	$(BIN)/python deploy/grafana/dashboard.py > deploy/grafana/dashboards/liir.json
 
+PIN := UV_CUSTOM_COMPILE_COMMAND="make requirements" $(BIN)/uv pip compile --quiet --universal \
+	--python-version 3.11 --generate-hashes --no-annotate
+requirements: setup ## Pin what pyproject.toml asks for, with hashes (ARGS="--upgrade" takes new versions)
+	$(PIN) pyproject.toml --extra service --extra animation --extra export --no-emit-package torch \
+		-o requirements.txt $(ARGS)
+	$(PIN) --group dev -c requirements.txt -o requirements-dev.txt $(ARGS)
+
 lint: setup ## Check style, types, import rules and generated code
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -73,4 +83,4 @@ proto: setup ## Generate the gRPC code from proto/
 proto-check: proto
 	git diff --exit-code -- $(GEN)
 
-.PHONY: help setup train test browser fuzz test-monitoring test-compose test-ray-submit dashboard lint proto proto-check
+.PHONY: help setup train test browser fuzz test-monitoring test-compose test-ray-submit dashboard requirements lint proto proto-check

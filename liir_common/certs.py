@@ -1,4 +1,10 @@
-"""`liir certs`: a CA, certificates and tokens for development; a second call renews what the CA signs."""
+"""`liir certs`: a CA, and a folder for each role with its certificate and token, for development.
+
+    ca.pem, ca-key.pem                       stay where they were made
+    ROLE/ca.pem, cert.pem, key.pem, tokens   all that a machine of the role needs: `security: FOLDER/ROLE`
+
+The roles are `learner`, which has everybody's tokens, and those of `Role`, which have their own.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +27,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from liir_common.errors import ConfigError
 from liir_common.files import write_atomic
-from liir_common.rpc.tokens import Role
+from liir_common.rpc.tokens import Role, Tokens
 
 LOCAL_HOSTS = ("localhost", "127.0.0.1", "::1")
 _CA_DAYS, _DAYS = 3650, 365
@@ -31,24 +37,36 @@ _TOKEN_BYTES = 32
 
 
 def make_certs(folder: Path, hosts: Sequence[str] = ()) -> None:
-    """Write ca, server and client certificates with their keys, and one token for each role.
+    """Write the CA and every role's folder; again, renew all certificates and hand out the tokens anew.
 
-    A CA and tokens that are there already are kept. The server's certificate holds for this machine's
-    loopback names and for `hosts`, names or IP addresses.
+    A CA and the learner's tokens that are there already are kept. The learner's certificate holds for this
+    machine's loopback names and for `hosts`, names or IP addresses.
 
     Raises:
-        ConfigError: the CA in `folder` cannot be used.
+        ConfigError: the CA or the learner's tokens in `folder` cannot be used.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    for role in ("learner", *Role):
+        (folder / role).mkdir(parents=True, exist_ok=True)
     ca, ca_key = _load_ca(folder) if (folder / "ca.pem").exists() else _make_ca(folder)
     names = [_general_name(host) for host in dict.fromkeys((*LOCAL_HOSTS, *hosts))]
-    # `liir train` shows the server's certificate as a client, too: its processes share one configuration.
+    # `liir train` shows the learner's certificate as a client, too: its processes share one configuration.
     both = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]
-    _issue(folder, "server", ca, ca_key, both, names)
-    _issue(folder, "client", ca, ca_key, [ExtendedKeyUsageOID.CLIENT_AUTH], [])
-    if not (folder / "tokens").exists():
+    _issue(folder / "learner", ca, ca_key, both, names)
+    for role in Role:
+        _issue(folder / role, ca, ca_key, [ExtendedKeyUsageOID.CLIENT_AUTH], [])
+    _hand_out_tokens(folder)
+
+
+def _hand_out_tokens(folder: Path) -> None:
+    """Give each role its lines of the learner's tokens file, which is written if it is missing."""
+    path = folder / "learner" / "tokens"
+    if not path.exists():
         lines = [f"{role} {secrets.token_urlsafe(_TOKEN_BYTES)}\n" for role in Role]
-        write_atomic(folder / "tokens", "".join(lines).encode(), _PRIVATE)
+        write_atomic(path, "".join(lines).encode(), _PRIVATE)
+    Tokens(str(path))  # raises here what would else stop the learner
+    for role in Role:
+        own = [line for line in path.read_bytes().splitlines() if line.split()[:1] == [role.encode()]]
+        write_atomic(folder / role / "tokens", b"".join(line + b"\n" for line in own), _PRIVATE)
 
 
 def _general_name(host: str) -> x509.GeneralName:
@@ -68,7 +86,8 @@ def _make_ca(folder: Path) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey
         .add_extension(usage, critical=True)
         .sign(key, hashes.SHA256())
     )
-    _write(folder, "ca", certificate, key)
+    write_atomic(folder / "ca-key.pem", _pem(key), _PRIVATE)
+    write_atomic(folder / "ca.pem", certificate.public_bytes(Encoding.PEM))
     return certificate, key
 
 
@@ -87,7 +106,6 @@ def _load_ca(folder: Path) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey
 
 def _issue(
     folder: Path,
-    name: str,
     ca: x509.Certificate,
     ca_key: ec.EllipticCurvePrivateKey,
     purposes: Sequence[x509.ObjectIdentifier],
@@ -95,7 +113,7 @@ def _issue(
 ) -> None:
     key = ec.generate_private_key(ec.SECP256R1())
     builder = (
-        _builder(_name(f"LIIR {name}"), ca.subject, key.public_key(), _DAYS)
+        _builder(_name(f"LIIR {folder.name}"), ca.subject, key.public_key(), _DAYS)
         .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
         .add_extension(_key_usage(signs_certificates=False), critical=True)
         .add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
@@ -105,7 +123,10 @@ def _issue(
     )
     if names:
         builder = builder.add_extension(x509.SubjectAlternativeName(names), critical=False)
-    _write(folder, name, builder.sign(ca_key, hashes.SHA256()), key)
+    certificate = builder.sign(ca_key, hashes.SHA256())
+    write_atomic(folder / "ca.pem", ca.public_bytes(Encoding.PEM))
+    write_atomic(folder / "key.pem", _pem(key), _PRIVATE)
+    write_atomic(folder / "cert.pem", certificate.public_bytes(Encoding.PEM))
 
 
 def _builder(
@@ -142,7 +163,5 @@ def _name(common_name: str) -> x509.Name:
     return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common_name)])
 
 
-def _write(folder: Path, name: str, certificate: x509.Certificate, key: ec.EllipticCurvePrivateKey) -> None:
-    pem = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
-    write_atomic(folder / f"{name}-key.pem", pem, _PRIVATE)
-    write_atomic(folder / f"{name}.pem", certificate.public_bytes(Encoding.PEM))
+def _pem(key: ec.EllipticCurvePrivateKey) -> bytes:
+    return key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())

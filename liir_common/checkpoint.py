@@ -21,6 +21,7 @@ from safetensors.numpy import load, save
 
 from liir_common.errors import CorruptError
 from liir_common.files import write_atomic
+from liir_common.types import EnvSpec
 
 Tensors = Mapping[str, NDArray[np.float32]]
 
@@ -44,6 +45,11 @@ class Manifest:
     sha256: str
     """Of the weights file, as hex."""
     size_bytes: int
+
+    @property
+    def spec(self) -> EnvSpec:
+        """The environment it was trained on."""
+        return EnvSpec(**{**self.env_spec, "info_keys": tuple(self.env_spec["info_keys"])})
 
     def to_json(self) -> str:
         """The manifest file's text."""

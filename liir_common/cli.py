@@ -5,13 +5,19 @@ from __future__ import annotations
 import importlib
 import json
 import sys
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from liir_common import options
 from liir_common.errors import ConfigError, UnreachableError, exit_on_error
+
+if TYPE_CHECKING:
+    from liir_common.client import CheckpointClient
 
 app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, add_completion=False)
 checkpoints = typer.Typer(no_args_is_help=True, help="Frozen checkpoints of a running learner.")
@@ -31,6 +37,7 @@ _PASS_ON = {"allow_extra_args": True, "ignore_unknown_options": True, "help_opti
 
 def main() -> None:
     """Entry point of the `liir` command."""
+    warnings.formatwarning = lambda message, *_, **__: f"warning: {message}\n"
     with exit_on_error():
         app()
 
@@ -119,15 +126,35 @@ def stop(
         client.stop(reason)
 
 
-@checkpoints.command("list")
-def list_checkpoints(
-    learner: options.Learner, config: options.ConfigFile = None, settings: options.Settings = None
-) -> None:
-    """One line per checkpoint: episode, environment steps, policy version, size, SHA-256."""
-    from liir_common.client import CheckpointClient, refusals_explained
+OnMap = Annotated[str, typer.Option("--map", help="End with an error if the run is not on this map.")]
+
+
+@contextmanager
+def _checkpoints(
+    learner: str, map_name: str, config: Path | None, settings: list[str] | None
+) -> Iterator[CheckpointClient]:
+    """A client of the learner, which trains on the map if one is named."""
+    from liir_common.client import CheckpointClient, learners_config, refusals_explained
+    from liir_common.rpc.tokens import Role
 
     security = options.load_security(config, settings)
+    if map_name:
+        label = learners_config(learner, (), security, Role.READER).env.label
+        if label != map_name:
+            raise ConfigError(f"wanted a run on {map_name}; the learner at {learner} trains on {label}")
     with CheckpointClient(learner, 10, security) as client, refusals_explained():
+        yield client
+
+
+@checkpoints.command("list")
+def list_checkpoints(
+    learner: options.Learner,
+    map_name: OnMap = "",
+    config: options.ConfigFile = None,
+    settings: options.Settings = None,
+) -> None:
+    """One line per checkpoint: episode, environment steps, policy version, size, SHA-256."""
+    with _checkpoints(learner, map_name, config, settings) as client:
         for frozen in client.list():
             print(_line(frozen))
 
@@ -136,38 +163,48 @@ def list_checkpoints(
 def watch_checkpoints(
     learner: options.Learner,
     after: int = 0,
+    map_name: OnMap = "",
     config: options.ConfigFile = None,
     settings: options.Settings = None,
 ) -> None:
     """The same lines as they come, until the run is complete."""
-    from liir_common.client import CheckpointClient, refusals_explained
-
-    security = options.load_security(config, settings)
-    with CheckpointClient(learner, 10, security) as client, refusals_explained():
+    with _checkpoints(learner, map_name, config, settings) as client:
         for frozen in client.watch(after):
             print(_line(frozen), flush=True)
 
 
 @checkpoints.command("get")
 def get_checkpoint(
-    episode: int,
+    episode: Annotated[int, typer.Argument(min=1)],
     learner: options.Learner,
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write into.")] = Path(),
+    output: Output = Path(),
+    map_name: OnMap = "",
     config: options.ConfigFile = None,
     settings: options.Settings = None,
 ) -> None:
-    """Download a checkpoint: its weights (safetensors) and its manifest (JSON), checked."""
-    from liir_common.client import CheckpointClient, refusals_explained
-    from liir_common.files import write_atomic
+    """Download a checkpoint: its weights (safetensors) and its manifest (JSON), checked; goes on if cut."""
+    with _checkpoints(learner, map_name, config, settings) as client:
+        print(client.save(episode, output))
 
-    security = options.load_security(config, settings)
-    with CheckpointClient(learner, 10, security) as client, refusals_explained():
-        manifest, data = client.download(episode)
-    output.mkdir(parents=True, exist_ok=True)
-    stem = output / f"checkpoint-{episode:09d}"
-    write_atomic(stem.with_suffix(".safetensors"), data)
-    write_atomic(stem.with_suffix(".json"), manifest.to_json().encode())
-    print(stem.with_suffix(".safetensors"))
+
+@checkpoints.command("best")
+def best_checkpoint(
+    learner: options.Learner,
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="Folder to download it into.")] = None,
+    map_name: OnMap = "",
+    config: options.ConfigFile = None,
+    settings: options.Settings = None,
+) -> None:
+    """The line of the checkpoint with most wins in its tests so far, and what it won."""
+    with _checkpoints(learner, map_name, config, settings) as client:
+        tested = client.best()
+        wins = ", ".join(
+            f"{mode} {stats.wins}/{stats.episodes}"
+            for mode, stats in (("greedy", tested.greedy), ("sampled", tested.sampled))
+        )
+        print(f"{_line(client.find(tested.episode))}  won {wins}; return {tested.greedy.return_mean:.2f}")
+        if output is not None:
+            print(client.save(tested.episode, output))
 
 
 def _line(frozen: Any) -> str:
@@ -177,6 +214,22 @@ def _line(frozen: Any) -> str:
     )
 
 
+@app.command("export")
+def export_policy(
+    checkpoint: Annotated[Path, typer.Argument(help="Checkpoint file, its manifest beside it.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="File to write.")] = Path("policy.onnx"),
+) -> None:
+    """Write a checkpoint's policy as an ONNX graph: one decision of a batch of teams."""
+    from liir_common.export import to_onnx
+    from liir_common.files import write_atomic
+    from liir_common.replay.load import load_checkpoint
+
+    if not output.parent.is_dir():
+        raise ConfigError(f"{output.parent} is no folder; make it first")
+    write_atomic(output, to_onnx(*load_checkpoint(checkpoint)))
+    print(output)
+
+
 @app.command()
 def certs(
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write into.")] = Path("certs"),
@@ -184,13 +237,15 @@ def certs(
         list[str] | None, typer.Option("--host", help="Name or address of the learner beside localhost.")
     ] = None,
 ) -> None:
-    """Make a development CA, certificates and tokens; again, renew the certificates with the same CA."""
+    """Make a development CA and each role's certificate and token; again, renew the certificates."""
     from liir_common.certs import make_certs
+    from liir_common.rpc.tokens import Role
 
     make_certs(output, hosts or ())
-    print(f"security: {{ca: {output}/ca.pem, client_ca: {output}/ca.pem, tokens: {output}/tokens,")
-    print(f"           cert: {output}/server.pem, key: {output}/server-key.pem}}")
-    print(f"# clients elsewhere: {output}/client.pem and -key.pem, and only their role's line of the tokens")
+    print(f"security: {output}/learner")
+    print(
+        f"# clients elsewhere have the folder of their role: {', '.join(f'{output}/{role}' for role in Role)}"
+    )
 
 
 @app.command()
@@ -224,7 +279,7 @@ def replay(
         str | None, typer.Option("--map", help="Battle map; that of the training if absent.")
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of the battle.")] = 0,
-    sampled: Annotated[bool, typer.Option("--sampled", help="Draw actions from the policy.")] = False,
+    sampled: Annotated[bool, typer.Option("--sampled", help="Draw actions, as sampled tests do.")] = False,
     output: Annotated[
         Path, typer.Option("--output", "-o", help=".html to explore; .gif or .mp4 to watch.")
     ] = Path("battle.html"),
@@ -233,12 +288,10 @@ def replay(
     from liir_common.replay.load import find_checkpoint, load_checkpoint
     from liir_common.replay.record import record
     from liir_common.replay.write import check_output, write
-    from liir_common.types import Exploration
 
     check_output(output)
     manifest, tensors = load_checkpoint(find_checkpoint(checkpoint, run_dir, best))
-    exploration = Exploration.SOFTMAX_FLOOR if sampled else Exploration.GREEDY
-    recording = record(manifest, tensors, seed, exploration, map_name)
+    recording = record(manifest, tensors, seed, sampled, map_name)
     write(recording, output)
     trajectory = recording.trajectory
     result = "won" if trajectory.info["won"] else "not won"

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import json
+import os
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
+from typing import BinaryIO
 
 import grpc
 import numpy as np
@@ -13,8 +18,9 @@ from numpy.typing import NDArray
 
 from liir_common.checkpoint import Manifest, unpack
 from liir_common.config import PLAINTEXT, Config, SecurityConfig, from_tree, merge, parse_settings
-from liir_common.errors import LiirError, RefusedError, UnreachableError
-from liir_common.rpc.channel import DEADLINE_S, connect
+from liir_common.errors import CorruptError, LiirError, RefusedError, UnreachableError
+from liir_common.files import write_atomic
+from liir_common.rpc.channel import DEADLINE_S, backoffs, connect
 from liir_common.rpc.gen.liir.v1 import (
     checkpoint_pb2,
     checkpoint_pb2_grpc,
@@ -27,6 +33,7 @@ AWAY = (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.DEADLINE_EXCEEDED)
 """Codes that tell of the connection, not of the call: to try again may help."""
 _PAGE = 1000
 _DOWNLOAD_TRIES = 5
+"""In a row that brought nothing; then a download is given up."""
 _WATCH_S = 20.0
 """After that a stream is asked for anew, from where it was: no silence is taken for a wait for ever."""
 
@@ -86,29 +93,69 @@ class CheckpointClient:
             after_episode = page[-1].episode
 
     def download(self, episode: int) -> tuple[Manifest, bytes]:
-        """Manifest and weights file of one checkpoint; a broken download goes on where it broke.
+        """Manifest and weights file of one checkpoint; a download that breaks goes on where it broke.
 
         Raises:
             LiirError: there is no such checkpoint, or the learner's copy is damaged.
             UnreachableError: the connection kept breaking.
             CorruptError: the bytes that came do not have the manifest's digest.
         """
-        data = bytearray()
-        for _ in range(_DOWNLOAD_TRIES):
-            try:
-                manifest = self._download_rest(episode, data)
-            except grpc.RpcError as error:
-                if error.code() not in AWAY:
-                    raise LiirError(f"checkpoint {episode}: {error.details()}") from None
-                continue
-            unpack(bytes(data), manifest.sha256)
-            return manifest, bytes(data)
-        raise UnreachableError(f"checkpoint {episode}: the download broke {_DOWNLOAD_TRIES} times")
+        file = io.BytesIO()
+        manifest = self._fetch(episode, file)
+        unpack(file.getvalue(), manifest.sha256)
+        return manifest, file.getvalue()
+
+    def save(self, episode: int, folder: Path) -> Path:
+        """Download a checkpoint into `folder`, made if missing; returns the weights file.
+
+        What was cut, this process included, goes on where it was cut. A checkpoint is there when its
+        manifest is, which is written last. Raises what `download` raises.
+        """
+        folder.mkdir(parents=True, exist_ok=True)
+        # Named by the digest: what another checkpoint of that name left is never gone on with.
+        part = folder / f".{self.find(episode).sha256}.part"
+        with part.open("ab") as file:
+            manifest = self._fetch(episode, file)
+            file.flush()
+            os.fsync(file.fileno())
+        try:
+            unpack(part.read_bytes(), manifest.sha256)
+        except CorruptError:
+            part.unlink()
+            raise
+        weights = folder / f"checkpoint-{episode:09d}.safetensors"
+        part.replace(weights)
+        write_atomic(weights.with_suffix(".json"), manifest.to_json().encode())
+        return weights
 
     def get(self, episode: int) -> tuple[Manifest, dict[str, NDArray[np.float32]]]:
         """Manifest and tensors of one checkpoint; raises what `download` raises."""
         manifest, data = self.download(episode)
         return manifest, unpack(data, manifest.sha256)
+
+    def find(self, episode: int) -> checkpoint_pb2.Checkpoint:
+        """The checkpoint frozen after `episode` episodes.
+
+        Raises:
+            LiirError: there is none.
+        """
+        frozen = next(self.list(after_episode=max(0, episode - 1)), None)
+        if frozen is None or frozen.episode != episode:
+            raise LiirError(
+                f"no checkpoint of episode {episode}; `liir checkpoints list` says which there are"
+            )
+        return frozen
+
+    def best(self) -> checkpoint_pb2.Evaluation:
+        """The best test: by greedy win rate, then sampled win rate, then greedy return, then youth.
+
+        Raises:
+            LiirError: no checkpoint has been tested yet.
+        """
+        best = max(self.evaluations(), key=_merit, default=None)
+        if best is None:
+            raise LiirError("no checkpoint has been tested yet; wait for the evaluator")
+        return best
 
     def watch(self, after_episode: int = 0) -> Iterator[checkpoint_pb2.Checkpoint]:
         """Every checkpoint after a position, in order, those to come included; ends with the run.
@@ -143,14 +190,33 @@ class CheckpointClient:
                 return
             after_episode = page[-1].episode
 
-    def _download_rest(self, episode: int, data: bytearray) -> Manifest:
-        """Append what is missing to `data`."""
-        request = checkpoint_pb2.GetCheckpointRequest(episode=episode, offset=len(data))
+    def _fetch(self, episode: int, file: BinaryIO) -> Manifest:
+        """Append what is missing to `file`; raises what `download` raises, but checks no digest."""
+        failures, waits = 0, backoffs()
+        while failures < _DOWNLOAD_TRIES:
+            begin = file.tell()
+            try:
+                return self._append_rest(episode, file)
+            except grpc.RpcError as error:
+                if error.code() not in AWAY:
+                    raise LiirError(f"checkpoint {episode}: {error.details()}") from None
+            failures = failures + 1 if file.tell() == begin else 0
+            time.sleep(next(waits))
+        raise UnreachableError(f"checkpoint {episode}: the download broke {failures} times; try again later")
+
+    def _append_rest(self, episode: int, file: BinaryIO) -> Manifest:
+        request = checkpoint_pb2.GetCheckpointRequest(episode=episode, offset=file.tell())
         responses = self._stub.GetCheckpoint(request, timeout=DEADLINE_S)
         manifest = Manifest.from_json(next(responses).header.manifest_json)
         for response in responses:
-            data += response.chunk
+            file.write(response.chunk)
         return manifest
+
+
+def _merit(evaluation: checkpoint_pb2.Evaluation) -> tuple[float, ...]:
+    greedy, sampled = evaluation.greedy, evaluation.sampled
+    rates = (tested.wins / tested.episodes for tested in (greedy, sampled))
+    return *rates, greedy.return_mean, evaluation.episode
 
 
 class TrainingClient:

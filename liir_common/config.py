@@ -18,6 +18,7 @@ from pydantic_settings import (
     InitSettingsSource,
     PydanticBaseSettingsSource,
     SettingsConfigDict,
+    SettingsError,
 )
 
 from liir_common.errors import ConfigError
@@ -57,8 +58,8 @@ class ExplorationConfig(Section):
     """ε of the behaviour policy, lowered linearly over environment steps."""
 
     start: float = Field(0.5, ge=0, le=1)
-    end: float = Field(0.01, ge=0, le=1)
-    steps: int = Field(50_000, ge=0)
+    end: float = Field(0.05, ge=0, le=1)
+    steps: int = Field(300_000, ge=0)
 
     def epsilon(self, env_steps: int) -> float:
         """ε after `env_steps` steps of the run."""
@@ -147,10 +148,23 @@ class AlgorithmConfig(Section):
     """Hidden units of the networks that make the mixer's weights."""
 
     @property
+    def value_based(self) -> bool:
+        """Whether the policy's outputs are Q values, of which a softmax means nothing."""
+        return self.name in ("iql", "vdn", "qmix")
+
+    @property
     def behaviour(self) -> Exploration:
         """How actors choose actions."""
-        value_based = self.name in ("iql", "vdn", "qmix")
-        return Exploration.EPSILON_GREEDY if value_based else Exploration.SOFTMAX_FLOOR
+        return Exploration.EPSILON_GREEDY if self.value_based else Exploration.SOFTMAX_FLOOR
+
+    def frozen_choice(self, sampled: bool) -> tuple[Exploration, float]:
+        """How a frozen policy chooses, and its epsilon: the best action, or if `sampled` as it was trained.
+
+        Then it draws from the policy; where values are learned, ε-greedy with the ε at which training ends.
+        """
+        if not sampled:
+            return Exploration.GREEDY, 0.0
+        return self.behaviour, self.exploration.end if self.value_based else 0.0
 
     @model_validator(mode="after")
     def _coma_sees_actions(self) -> Self:
@@ -228,7 +242,10 @@ FilePath = Annotated[str, AfterValidator(_absolute)]
 
 
 class SecurityConfig(Section):
-    """TLS and tokens of this process. It names files: no secret is ever part of a configuration."""
+    """TLS and tokens of this process. It names files: no secret is ever part of a configuration.
+
+    The name of a folder that holds them all, as `liir certs` makes one per role, may stand for the section.
+    """
 
     ca: FilePath = ""
     """Client: CA certificates (PEM) that the learner's must come from; empty speaks plaintext."""
@@ -240,6 +257,15 @@ class SecurityConfig(Section):
     """Learner: CA certificates (PEM) that every client's must come from; empty asks for none."""
     tokens: FilePath = ""
     """Lines `ROLE TOKEN [EXPIRES]`; the variable LIIR_TOKENS may hold them instead."""
+
+    @classmethod
+    def of(cls, folder: str | Path) -> Self:
+        """The files of a role's folder.
+
+        Raises:
+            ConfigError: there is no such folder.
+        """
+        return cls(**_files_of_role(folder))
 
     @model_validator(mode="after")
     def _check_pairs(self) -> Self:
@@ -325,6 +351,7 @@ PRESETS: Mapping[str, dict[str, Any]] = {
             "critic_epochs": 1,
             "entropy": 0.0,
             "orthogonal_init": False,
+            "exploration": {"start": 0.5, "end": 0.01, "steps": 50_000},
             "policy_optimizer": _RMSPROP,
             # ‖∇η‖ is 1e-5 to 2e-4: with the eps of the others η would hardly move.
             "eta_optimizer": _RMSPROP | {"eps": 1e-10},
@@ -384,6 +411,10 @@ def load(path: Path | None = None, settings: Sequence[str] = ()) -> Config:
         return Config(**sources)
     except ValidationError as error:
         raise ConfigError(_explain(error)) from None
+    except SettingsError as error:
+        raise ConfigError(
+            f"the environment has a section that is not JSON ({error}); set its keys, as in LIIR_ENV__MAP=8m"
+        ) from None
 
 
 def from_tree(tree: Mapping[str, Any]) -> Config:
@@ -413,12 +444,30 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _spelled_out(tree: dict[str, Any]) -> dict[str, Any]:
-    """`algorithm: qmix` is short for `algorithm: {name: qmix}`, and `env: smac` for `env: {kind: smac}`."""
+    """`algorithm: qmix` is short for `algorithm: {name: qmix}`, and `env: smac` for `env: {kind: smac}`.
+
+    `security: FOLDER` is short for the names of the files that `liir certs` put there.
+    """
     short = {"algorithm": "name", "env": "kind"}
-    return {
+    spelled = {
         key: {short[key]: value} if key in short and isinstance(value, str) else value
         for key, value in tree.items()
     }
+    if isinstance(folder := tree.get("security"), str):
+        spelled["security"] = _files_of_role(folder)
+    return spelled
+
+
+def _files_of_role(folder: str | Path) -> dict[str, str]:
+    path = Path(folder).expanduser()
+    if not path.is_dir():
+        # Not quoted: somebody may have written a token there.
+        raise ConfigError(
+            "security: wanted the folder of a role, as `liir certs` makes it, or a section with names of "
+            "files; got the name of no folder"
+        )
+    files = {"ca": "ca.pem", "client_ca": "ca.pem", "cert": "cert.pem", "key": "key.pem", "tokens": "tokens"}
+    return {key: str(path / name) for key, name in files.items()}
 
 
 def _named(data: Mapping[str, Any], section: str, key: str) -> str:

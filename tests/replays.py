@@ -21,6 +21,7 @@ HIDDEN, BOUND = 16, 2.0
 def publish(run_dir: Path, episode: int = 100, map_name: str = "2s3z", method: str = "liir") -> Path:
     """Freeze a policy, and with method liir an intrinsic reward, in `run_dir`; returns the weights file."""
     settings = [f"env.map={map_name}", f"algorithm.name={method}", f"algorithm.r_in_bound={BOUND}"]
+    settings.append(f"algorithm.policy_hidden={HIDDEN}")
     run = config.load(settings=settings)
     spec = env_spec(run.env)
     tensors = {f"policy.{name}": array for name, array in random_weights(spec, HIDDEN, episode).items()}

@@ -24,7 +24,7 @@ from liir_common.battle.units import (
     SHIELD_REGENERATION,
 )
 
-SIMULATOR_VERSION = "1"
+SIMULATOR_VERSION = "2"
 """Changes whenever the same seed and actions would give other bytes."""
 
 STEPS, TERMINATED, TRUNCATED, WON, DEAD_ALLIES, DEAD_ENEMIES, LOST = range(7)

@@ -63,7 +63,7 @@ class Parameters:
     """What no source settles about the game; the defaults together fit the
     published figures best (`calibrate`)."""
 
-    head_start: int = _at_least(2, 0)
+    head_start: int = _at_least(1, 0)
     """Loops that the enemies walk before the first observation."""
     order_latency: int = _at_least(1, 0)
     """Loops from a decision to its first effect."""
@@ -71,7 +71,7 @@ class Parameters:
     """Units stand on a square grid around their point instead of in hexagonal rings."""
     separation_collision: bool = False
     """Discs collide with the separation radius instead of the radius."""
-    slide: float = field(default=0.9, metadata={"minimum": 0, "maximum": 1})
+    slide: float = field(default=1.0, metadata={"minimum": 0, "maximum": 1})
     """Share of the blocked motion that goes sideways around the blocker."""
     push_idle: bool = True
     """Walking units push idle units of their team aside."""
@@ -85,7 +85,7 @@ class Parameters:
     """An attack that is interrupted before its first hit costs no cooldown."""
     integer_delay: bool = False
     """The random delay between attacks is a whole number of loops."""
-    rescan_period: int = _at_least(6, 1)
+    rescan_period: int = _at_least(8, 1)
     """Loops between two looks for a target, for a unit that has none."""
     drop_beyond_reach: bool = False
     """Enemies drop a target that is beyond their weapon instead of one beyond their scan range."""

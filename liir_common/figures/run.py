@@ -57,14 +57,13 @@ def load(run_dir: Path, episode: int | None = None) -> Frozen:
         )
     manifest = store.manifests[-1] if episode is None else store.find(episode)
     tensors = unpack(store.read(manifest), manifest.sha256)
-    fields = dict(manifest.env_spec) | {"info_keys": tuple(manifest.env_spec["info_keys"])}
     return Frozen(
         run_dir.name,
         manifest.episode,
         manifest.git_commit,
         manifest.sha256,
         from_tree(manifest.config),
-        EnvSpec(**fields),
+        manifest.spec,
         section(tensors, "policy"),
         IntrinsicReward.from_checkpoint(manifest, tensors),
     )

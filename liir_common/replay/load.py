@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 from liir_common import checkpoint
+from liir_common.battle.engine import SIMULATOR_VERSION
 from liir_common.checkpoint import Manifest
 from liir_common.errors import ConfigError
 from liir_common.files import read_table
@@ -13,6 +15,8 @@ from liir_common.types import Weights
 
 def load_checkpoint(path: Path) -> tuple[Manifest, Weights]:
     """The manifest and all tensors of the checkpoint whose .safetensors or .json file is `path`.
+
+    Warns if it was trained on battles that another version of the simulator played.
 
     Raises:
         ConfigError: one of the two files cannot be read.
@@ -26,7 +30,20 @@ def load_checkpoint(path: Path) -> tuple[Manifest, Weights]:
             f"a checkpoint is a .safetensors file with its .json beside it; cannot read {error.filename}: "
             f"{error.strerror}"
         ) from None
-    return manifest, checkpoint.unpack(data, manifest.sha256)
+    tensors = checkpoint.unpack(data, manifest.sha256)
+    _warn_of_another_simulator(manifest)
+    return manifest, tensors
+
+
+def _warn_of_another_simulator(manifest: Manifest) -> None:
+    spec = manifest.spec
+    if spec.name.startswith("battle/") and spec.version != SIMULATOR_VERSION:
+        warnings.warn(
+            f"checkpoint {manifest.episode} was trained with version {spec.version} of the battle simulator, "
+            f"and version {SIMULATOR_VERSION} is installed: battles go differently from those of its "
+            f"training and its tests; to see those, use the build of commit {manifest.git_commit}",
+            stacklevel=3,
+        )
 
 
 def find_checkpoint(file: Path | None, run_dir: Path | None, best: bool = False) -> Path:
@@ -53,10 +70,10 @@ def _latest(run_dir: Path) -> Path:
 
 
 def _best(run_dir: Path) -> Path:
-    """By greedy win rate, then sampled win rate, then age: the youngest."""
+    """As `CheckpointClient.best`."""
     tests = read_table(run_dir / "evaluations.csv")
     if not tests:
         raise ConfigError(f"{run_dir} holds no evaluation; leave out --best to take the latest checkpoint")
-    keys = ("greedy_win_rate", "sampled_win_rate", "episode")
+    keys = ("greedy_win_rate", "sampled_win_rate", "greedy_return_mean", "episode")
     best = max(tests, key=lambda test: [float(test[key]) for key in keys])
     return run_dir / "checkpoints" / f"checkpoint-{int(best['episode']):09d}.json"

@@ -48,6 +48,7 @@ def page_data(recording: Recording) -> dict[str, Any]:
         "actionNames": _ACTIONS,
         "actions": trajectory.actions.tolist(),
         "choices": [[_choices(recording, t, i) for i in range(n)] for t in range(trajectory.length)],
+        "hasQ": recording.q_values is not None,
         "hasIntrinsic": recording.intrinsic is not None,
         "rewards": _rounded(trajectory.reward, 3),
     }
@@ -80,12 +81,12 @@ def _situation(unit: UnitRecord, n_allies: int) -> list[Any]:
 
 
 def _choices(recording: Recording, step: int, agent: int) -> list[list[float]]:
-    """[action, probability, r_in] of each available action of a living agent; two numbers without r_in."""
+    """[action, probability or Q value, r_in if learned] of each available action of a living agent."""
     if not recording.trajectory.alive[step, agent]:
         return []
-    columns = [recording.probabilities] + ([] if recording.intrinsic is None else [recording.intrinsic])
+    columns = (recording.probabilities, recording.q_values, recording.intrinsic)
     return [
-        [int(action), *(_rounded(column[step, agent, action], 4) for column in columns)]
+        [int(action), *(_rounded(column[step, agent, action], 4) for column in columns if column is not None)]
         for action in np.flatnonzero(recording.trajectory.mask[step, agent])
     ]
 

@@ -18,13 +18,22 @@ from liir_common.battle.scenarios import make_battle
 from liir_common.battle.tables import FIRST_ATTACK
 from liir_common.battle.units import UNIT_TYPES
 from liir_common.checkpoint import Manifest
-from liir_common.config import EnvConfig
+from liir_common.config import AlgorithmConfig, EnvConfig
 from liir_common.errors import ConfigError
 from liir_common.intrinsic import IntrinsicReward
 from liir_common.rollout.loop import LoopPlayer
 from liir_common.rollout.play import env_spec
 from liir_common.rollout.policy import MODES, Choice, act, pack
-from liir_common.types import EnvSpec, Exploration, FloatArray, IntArray, Ticket, Trajectory, Weights
+from liir_common.types import (
+    BoolArray,
+    EnvSpec,
+    Exploration,
+    FloatArray,
+    IntArray,
+    Ticket,
+    Trajectory,
+    Weights,
+)
 
 HEALERS = frozenset(name for name, unit in UNIT_TYPES.items() if unit.weapon is None)
 """Unit types whose targets are their friends"""
@@ -48,8 +57,10 @@ class Recording:
     shots: Sequence[Sequence[Shot]]
     """T of them: the attacks that began within each step"""
     trajectory: Trajectory
-    probabilities: FloatArray
-    """[T, n, A], softmax over the available actions, however the action was chosen"""
+    probabilities: FloatArray | None
+    """[T, n, A], softmax over the available actions, however the action was chosen; None with Q values"""
+    q_values: FloatArray | None
+    """[T, n, A], 0 where unavailable; None where the method learns probabilities"""
     intrinsic: FloatArray | None
     """[T, n, A], r_in of every action; None where the method learns none"""
 
@@ -58,7 +69,7 @@ def record(
     manifest: Manifest,
     tensors: Weights,
     seed: int = 0,
-    exploration: Exploration = Exploration.GREEDY,
+    sampled: bool = False,
     map_name: str | None = None,
 ) -> Recording:
     """Play the battle that `env.reset(seed)` begins.
@@ -66,7 +77,7 @@ def record(
     Args:
         manifest, tensors: a checkpoint, as `load_checkpoint` returns it.
         seed: 64 bits, for the battle and for what is drawn from the policy.
-        exploration: GREEDY, or SOFTMAX_FLOOR to draw from the policy.
+        sampled: choose as in sampled tests (`AlgorithmConfig.frozen_choice`), not the best action every time.
         map_name: another map than that of the training, with the same sizes.
 
     Raises:
@@ -79,6 +90,8 @@ def record(
     if not 0 <= seed < 2**64:
         raise ConfigError(f"a seed wants an integer in [0, 2**64), got {seed}")
     map_name = map_name or env.map
+    algorithm = AlgorithmConfig.model_validate(manifest.config["algorithm"])
+    exploration, epsilon = algorithm.frozen_choice(sampled)
     options: dict[str, Any] = dict(env.options)
     spec, weights = env_spec(env.model_copy(update={"map": map_name})), checkpoint.section(tensors, "policy")
     battle = _WatchedBattle(map_name, **options)
@@ -87,7 +100,8 @@ def record(
         player.load(weights)
     except ValueError as error:
         raise ConfigError(f"{map_name} does not fit a policy trained on {env.map}: {error}") from None
-    trajectory = player.play(Ticket(0, manifest.policy_version, seed, exploration, epsilon=0.0))
+    trajectory = player.play(Ticket(0, manifest.policy_version, seed, exploration, epsilon))
+    outputs = policy_outputs(weights, spec, trajectory)
     return Recording(
         map_name=map_name,
         seed=seed,
@@ -97,7 +111,8 @@ def record(
         frames=battle.frames,
         shots=_all_shots(battle.frames, trajectory.actions, resolve(options).step_mul),
         trajectory=trajectory,
-        probabilities=policy_probabilities(weights, spec, trajectory),
+        probabilities=None if algorithm.value_based else _softmax(outputs, trajectory.mask[:-1]),
+        q_values=np.where(trajectory.mask[:-1], outputs, 0) if algorithm.value_based else None,
         intrinsic=_intrinsic(manifest, tensors, trajectory),
     )
 
@@ -116,22 +131,26 @@ class _WatchedBattle(BattleEnv):
         return result
 
 
-def policy_probabilities(weights: Weights, spec: EnvSpec, trajectory: Trajectory) -> FloatArray:
-    """[T, n, A], the softmax policy's probability of every action along an episode; 0 where unavailable."""
+def policy_outputs(weights: Weights, spec: EnvSpec, trajectory: Trajectory) -> FloatArray:
+    """[T, n, A], what the network says of every action along an episode, available or not."""
     hidden = np.zeros((spec.n_agents, len(weights["fc1.bias"])), np.float32)
     policy = pack(weights, spec, hidden.shape[1])
     choice = Choice(np.zeros(1, np.uint64), MODES[Exploration.GREEDY], 0.0)
     last, chosen = np.full(spec.n_agents, -1), np.zeros(spec.n_agents, np.int64)
     log_mu = np.zeros(spec.n_agents, np.float32)
-    probabilities = np.zeros(trajectory.mask[:-1].shape, np.float32)
+    outputs = np.zeros(trajectory.mask[:-1].shape, np.float32)
     for t in range(trajectory.length):
-        mask = trajectory.mask[t]
-        act(policy, hidden, trajectory.obs[t], last, mask, choice, chosen, log_mu)
-        logits = np.where(mask, policy.logits, -np.inf)
-        exponentials = np.exp(logits - logits.max(-1, keepdims=True))
-        probabilities[t] = exponentials / exponentials.sum(-1, keepdims=True)
+        act(policy, hidden, trajectory.obs[t], last, trajectory.mask[t], choice, chosen, log_mu)
+        outputs[t] = policy.logits
         # What was done, not what this pass would have chosen, is what the policy sees next.
         last[:] = trajectory.actions[t]
+    return outputs
+
+
+def _softmax(outputs: FloatArray, mask: BoolArray) -> FloatArray:
+    logits = np.where(mask, outputs, -np.inf)
+    exponentials = np.exp(logits - logits.max(-1, keepdims=True))
+    probabilities: FloatArray = exponentials / exponentials.sum(-1, keepdims=True)
     return probabilities
 
 

@@ -14,7 +14,7 @@ from pettingzoo import ParallelEnv
 from liir_common.errors import EpisodeLostError
 from liir_common.rollout.player import Ending, Player
 from liir_common.rollout.policy import Choice, Policy, act, first_stuck, stuck_message
-from liir_common.types import EnvSpec, FloatArray, Ticket, Trajectory
+from liir_common.types import BoolArray, EnvSpec, FloatArray, Ticket, Trajectory
 
 log = structlog.get_logger()
 
@@ -104,25 +104,38 @@ class LoopPlayer(Player):
                 self._look_as(i, step, observations[agent], infos[agent])
             else:
                 self._look_dead(i, step)
-        if not np.isfinite(self._rows.obs[step]).all():
-            raise ValueError(f"step {step}: wanted finite observations, got {self._rows.obs[step]}")
-        stuck = first_stuck(self._rows.mask[step])
-        if stuck >= 0:
-            raise ValueError(stuck_message(stuck, step))
+        check_seen(step, self._rows.obs[step], self._rows.mask[step])
         self._rows.state[step] = _state(self._env, self._rows.obs[step])
 
     def _look_as(self, i: int, step: int, observation: Any, info: Mapping[str, Any]) -> None:
-        mask = info.get("action_mask", True)
-        if isinstance(observation, Mapping):
-            observation, mask = observation["observation"], observation["action_mask"]
-        self._rows.obs[step, i] = np.ravel(observation)
-        self._rows.mask[step, i] = mask
+        self._rows.obs[step, i], self._rows.mask[step, i] = read_observation(observation, info)
         self._rows.alive[step, i] = info.get("alive", True)
 
     def _look_dead(self, i: int, step: int) -> None:
         self._rows.obs[step, i] = 0
         self._rows.mask[step, i] = np.arange(self.spec.n_actions) == NO_OP
         self._rows.alive[step, i] = False
+
+
+def read_observation(observation: Any, info: Mapping[str, Any]) -> tuple[FloatArray, Any]:
+    """One agent's observation [O] and its action mask [A], which is True where every action is available."""
+    mask = info.get("action_mask", True)
+    if isinstance(observation, Mapping):
+        observation, mask = observation["observation"], observation["action_mask"]
+    return np.ravel(observation), mask
+
+
+def check_seen(step: int, obs: FloatArray, mask: BoolArray) -> None:
+    """Return if a team can decide on obs [n, O] and mask [n, A].
+
+    Raises:
+        ValueError: an observation is not finite, or an agent has no available action.
+    """
+    if not np.isfinite(obs).all():
+        raise ValueError(f"step {step}: wanted finite observations, got {obs}")
+    stuck = first_stuck(mask)
+    if stuck >= 0:
+        raise ValueError(stuck_message(stuck, step))
 
 
 def _team_reward(rewards: Mapping[str, float], step: int) -> float:
@@ -157,21 +170,30 @@ def loop_spec(env: Env, name: str, options: Mapping[str, Any]) -> EnvSpec:
     limit = getattr(game, "episode_limit", getattr(game, "max_cycles", None))
     if limit is None:
         raise ValueError(f"{name}: wanted the most steps it plays as attribute episode_limit or max_cycles")
-    sizes = {agent: (_obs_dim(env, agent), _n_actions(env, agent)) for agent in env.possible_agents}
-    if len(set(sizes.values())) != 1:
-        raise ValueError(f"{name}: wanted equal (observation, action) sizes for all agents, got {sizes}")
-    obs_dim, n_actions = next(iter(sizes.values()))
+    n_agents, obs_dim, n_actions = team_sizes(env, name)
     return EnvSpec(
         name=name,
         version=str(env.metadata.get("name", type(game).__name__)),
         options=json.dumps(dict(options), sort_keys=True, separators=(",", ":")),
-        n_agents=len(sizes),
+        n_agents=n_agents,
         n_actions=n_actions,
         obs_dim=obs_dim,
-        state_dim=_state_dim(env, np.zeros((len(sizes), obs_dim), np.float32)),
+        state_dim=_state_dim(env, np.zeros((n_agents, obs_dim), np.float32)),
         episode_limit=int(limit),
         info_keys=tuple(getattr(game, "info_keys", ())),
     )
+
+
+def team_sizes(env: Env, name: str) -> tuple[int, int, int]:
+    """Number of agents, of the values that each observes, and of its actions.
+
+    Raises:
+        ValueError: agents differ in their spaces, or a space is of an unsupported kind.
+    """
+    sizes = {agent: (_obs_dim(env, agent), _n_actions(env, agent)) for agent in env.possible_agents}
+    if len(set(sizes.values())) != 1:
+        raise ValueError(f"{name}: wanted equal (observation, action) sizes for all agents, got {sizes}")
+    return len(sizes), *next(iter(sizes.values()))
 
 
 def _state_dim(env: Env, obs: FloatArray) -> int:

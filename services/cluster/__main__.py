@@ -49,17 +49,15 @@ def on_cluster(request: launch.Request) -> launch.Launcher:
     nodes = {node["NodeManagerAddress"]: node["Resources"] for node in ray.nodes() if node["Alive"]}
     learner = Learner(request, run_dir, learners_place(request, nodes))
     address = learner.settle()
-    security = options.load_security(request.file, list(request.settings))
-    server = client = security
-    if security == PLAINTEXT and not request.config.learner.insecure:
-        server, client = make_security(Path("certs", run_dir.name).absolute(), address)
+    security = roles_security(request, Path("certs", run_dir.name).absolute(), address)
     learner.arguments += ["--set", f"learner.host={address}"]
-    learner.files = carry.pack(server)
+    learner.files = carry.pack(security["learner"])
     evaluator = RemoteService("evaluator", [], run_dir, _ANYWHERE)
-    evaluator.files = carry.pack(client, Role.EVALUATOR)
+    evaluator.files = carry.pack(security[Role.EVALUATOR], Role.EVALUATOR)
+    actor = launch.as_settings(security[Role.ACTOR])
     ray_settings = ["--set", "actors.ray_address=auto", "--set", "actors.send_security=true"]
-    actors = launch.LocalService("actor", [*launch.as_settings(client), *ray_settings], run_dir, "actors")
-    return launch.Launcher(run_dir, learner, actors, evaluator, client)
+    actors = launch.LocalService("actor", [*actor, *ray_settings], run_dir, "actors")
+    return launch.Launcher(run_dir, learner, actors, evaluator, security[Role.OPERATOR])
 
 
 class Learner(RemoteService):
@@ -111,18 +109,18 @@ def _on(resource: str, nodes: Mapping[str, Mapping[str, float]]) -> dict[str, An
     return {"num_cpus": 0, "num_gpus": min(1, gpus), "resources": {resource: 0.001}}
 
 
-def make_security(folder: Path, address: str) -> tuple[SecurityConfig, SecurityConfig]:
-    """Make or renew certificates and tokens in `folder`: the section of the learner, and of its clients."""
+def roles_security(request: launch.Request, folder: Path, address: str) -> dict[str, SecurityConfig]:
+    """The section `security` of the learner at `address` and of each role: as it is configured, or made now.
+
+    What is made stays in `folder`; made again, the CA and the tokens are the same.
+    """
+    roles = ("learner", *Role)
+    # Of a resumed run, too, this is what is said now: where its own section points to may be gone.
+    configured = options.load_security(request.file, list(request.settings))
+    if configured != PLAINTEXT or request.config.learner.insecure:
+        return dict.fromkeys(roles, configured)
     make_certs(folder, [address])
-    ca, tokens = str(folder / "ca.pem"), str(folder / "tokens")
-    pairs = {
-        name: {"cert": str(folder / f"{name}.pem"), "key": str(folder / f"{name}-key.pem")}
-        for name in ("server", "client")
-    }
-    return (
-        SecurityConfig(client_ca=ca, tokens=tokens, **pairs["server"]),
-        SecurityConfig(ca=ca, tokens=tokens, **pairs["client"]),
-    )
+    return {role: SecurityConfig.of(folder / role) for role in roles}
 
 
 if __name__ == "__main__":

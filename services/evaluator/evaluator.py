@@ -16,7 +16,7 @@ from liir_common.rollout.player import Player
 from liir_common.rpc.channel import backoffs
 from liir_common.rpc.gen.liir.v1 import checkpoint_pb2
 from liir_common.rpc.tokens import Role
-from liir_common.types import Exploration, Ticket, Weights
+from liir_common.types import Ticket, Weights
 
 log = structlog.get_logger()
 
@@ -26,13 +26,11 @@ def evaluate(
 ) -> checkpoint_pb2.EpisodeStats:
     """Play the test episodes of one checkpoint with seeds that no training episode has.
 
-    `mode` is "greedy" (the best action every time) or "sampled" (drawn from the policy; where values and
-    not probabilities are learned, ε-greedy with the ε at which training ends).
+    `mode` is "greedy" or "sampled", as `AlgorithmConfig.frozen_choice` has them.
     """
     player.load(weights)
     base = seeds.episode_seed(config.seed, seeds.EVALUATION, episode)
-    exploration = Exploration.GREEDY if mode == "greedy" else config.algorithm.behaviour
-    epsilon = config.algorithm.exploration.end if exploration == Exploration.EPSILON_GREEDY else 0.0
+    exploration, epsilon = config.algorithm.frozen_choice(sampled=mode == "sampled")
     episodes = config.evaluation.episodes
     played = [
         player.play(Ticket(index, 0, seeds.derive(base, index), exploration, epsilon))

@@ -1,4 +1,4 @@
-"""docker-compose.yml as a user runs it: up, deaths, stop, down, up again. Needs docker with compose.
+"""docker-compose.yml as a user runs it: up, deaths, rotations, down, up again. Needs docker with compose.
 
 COMPOSE_FILE may add an override; the project's containers and volumes of an earlier test are removed.
 """
@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import ssl
 import subprocess
 import time
 import urllib.parse
@@ -17,19 +19,26 @@ from pathlib import Path
 import grpc
 import pytest
 
-from liir_common.client import CheckpointClient, TrainingClient
+from liir_common.client import TrainingClient
+from liir_common.config import SecurityConfig
 from liir_common.errors import LiirError
 from liir_common.rpc.gen.liir.v1 import training_pb2
+from tests.e2e.service import LIIR
 
-pytestmark = [pytest.mark.compose, pytest.mark.timeout(900)]
+pytestmark = [pytest.mark.compose, pytest.mark.timeout(1800)]
 
 ROOT = Path(__file__).parents[2]
 LEARNER_PORT, PROMETHEUS_PORT, GRAFANA_PORT = 15051, 19090, 13000
+# Another address than the usual one, which the certificate must then hold for.
+LEARNER_ADDRESS = "127.0.0.2"
+LEARNER = f"{LEARNER_ADDRESS}:{LEARNER_PORT}"
 WORKERS, ACTORS = 3, 6
+EPISODE = 80
+DOCUMENT = ROOT / "docs/operations.md"
 SETTINGS = {
     "LIIR_ACTORS__COUNT": ACTORS,
     "LIIR_TRAINING__BATCH_EPISODES": 8,
-    "LIIR_TRAINING__CHECKPOINT_INTERVAL": 80,
+    "LIIR_TRAINING__CHECKPOINT_INTERVAL": EPISODE,
     "LIIR_TRAINING__SAVE_INTERVAL": 5,
     "LIIR_EVALUATION__EPISODES": 5,
     "LIIR_LEARNER__THREADS": 1,
@@ -45,34 +54,79 @@ for path in pathlib.Path('/proc').glob('[0-9]*/cmdline'):
 
 
 class Compose:
-    """The project in a name space of its own, on ports of its own."""
+    """The project in a name space of its own, on ports of its own, and a user's shell to steer it from."""
 
     def __init__(self, folder: Path) -> None:
-        """Put the run's settings into a file of `folder`."""
+        """Put the run's settings into a file of `folder`, in which commands are run."""
+        self.folder = folder
         settings = folder / "settings.env"
         settings.write_text("".join(f"{key}={value}\n" for key, value in SETTINGS.items()))
+        files = os.environ.get("COMPOSE_FILE", "docker-compose.yml").split(os.pathsep)
         self._environment = os.environ | {
+            "COMPOSE_PROJECT_NAME": "liir-test",
+            "COMPOSE_FILE": os.pathsep.join(str(ROOT / file) for file in files),
+            "PATH": os.pathsep.join((str(Path(LIIR).parent), os.environ["PATH"])),
             "ENV_FILE": str(settings),
+            "CERTS_ARGS": f"--host {LEARNER_ADDRESS}",
+            "LEARNER_ADDRESS": LEARNER_ADDRESS,
             "LEARNER_PORT": str(LEARNER_PORT),
             "PROMETHEUS_PORT": str(PROMETHEUS_PORT),
             "GRAFANA_PORT": str(GRAFANA_PORT),
         }
 
+    def run(self, command: list[str], code: int = 0) -> str:
+        """Run a command that ends with `code`; returns its output."""
+        done = subprocess.run(command, cwd=self.folder, env=self._environment, capture_output=True, text=True)
+        assert done.returncode == code, f"{' '.join(command)}:\n{done.stdout}{done.stderr}"
+        return done.stdout + done.stderr if code else done.stdout
+
     def __call__(self, *arguments: str) -> str:
         """Run `docker compose ARGUMENTS`; returns its output."""
-        done = subprocess.run(
-            ["docker", "compose", "--project-name", "liir-test", *arguments],
-            cwd=ROOT,
-            env=self._environment,
-            capture_output=True,
-            text=True,
-        )
-        assert done.returncode == 0, f"docker compose {' '.join(arguments)}:\n{done.stdout}{done.stderr}"
-        return done.stdout
+        return self.run(["docker", "compose", *arguments])
+
+    def documented(self, heading: str, code: int = 0) -> str:
+        """Run the commands below a heading of docs/operations.md as a user would, on this test's learner."""
+        block = re.search(rf"### {heading}\n.*?```\n(.*?)```", DOCUMENT.read_text(), re.DOTALL)
+        assert block, heading
+        commands = block[1].replace("127.0.0.1:50051", LEARNER).replace(" 1000 ", f" {EPISODE} ")
+        return self.run(["sh", "-ec", commands], code)
+
+    def liir(self, *command: str, code: int = 0) -> str:
+        """Run a `liir` command against the learner with the reader's folder that was last fetched."""
+        return self.run([LIIR, *command, "--learner", LEARNER, "--set", "security=reader"], code)
+
+    def client(self) -> TrainingClient:
+        """The same from Python."""
+        return TrainingClient(LEARNER, security=SecurityConfig.of(self.folder / "reader"))
+
+    def serving(self) -> bool:
+        """Whether the learner calls itself healthy, which it does without a token."""
+        with self.client() as client:
+            return client.serving()
+
+    def status(self) -> training_pb2.GetStatusResponse:
+        """How far the run is."""
+        with self.client() as client:
+            return client.status()
+
+    def fetched(self) -> tuple[bytes, bytes]:
+        """Manifest and weights as the documented command left them; they are gone then."""
+        stem = self.folder / "here" / f"checkpoint-{EPISODE:09d}"
+        files = stem.with_suffix(".json"), stem.with_suffix(".safetensors")
+        contents = files[0].read_bytes(), files[1].read_bytes()
+        for file in files:
+            file.unlink()
+        return contents
+
+    def secrets(self) -> set[str]:
+        """Every token, and every line of every private key."""
+        command = "cat /certs/*/tokens /certs/*/key.pem /certs/ca-key.pem"
+        lines = self("run", "--rm", "certs", "sh", "-c", command).splitlines()
+        return {line.split()[-1] for line in lines if "-----" not in line}
 
     def up(self) -> None:
         """Start everything and wait until it is healthy."""
-        self("up", "--detach", "--wait", "--wait-timeout", "300", "--scale", f"ray-worker={WORKERS}")
+        self("up", "--detach", "--wait", "--wait-timeout", "600", "--scale", f"ray-worker={WORKERS}")
 
     def processes(self, service: str, command: str, index: int = 1) -> list[str]:
         """Ids, inside the container, of the processes whose command line contains `command`."""
@@ -104,7 +158,7 @@ def compose(tmp_path: Path) -> Iterator[Compose]:
         compose("down", "--volumes", "--timeout", "5")
 
 
-def wait_for(condition: Callable[[], object], what: str, timeout_s: float = 180.0) -> None:
+def wait_for(condition: Callable[[], object], what: str, timeout_s: float = 300.0) -> None:
     """Poll until `condition` holds; an endpoint that is away does not hold."""
     deadline = time.monotonic() + timeout_s
     while True:
@@ -125,13 +179,12 @@ def query(expression: str) -> float:
     return max((float(sample["value"][1]) for sample in result), default=0.0)
 
 
-def status() -> training_pb2.GetStatusResponse:
-    """How far the run is, asked from outside of the network."""
-    with TrainingClient(f"127.0.0.1:{LEARNER_PORT}") as client:
-        return client.status()
+def served_certificate() -> str:
+    """The certificate that the learner shows to a new connection."""
+    return ssl.get_server_certificate((LEARNER_ADDRESS, LEARNER_PORT), timeout=10)
 
 
-def test_up_deaths_down_and_up_again(compose: Compose) -> None:
+def test_up_deaths_rotations_down_and_up_again(compose: Compose) -> None:
     compose.up()
 
     # Every process is scraped, the actors sit on all workers and nowhere else, battles are won.
@@ -143,6 +196,14 @@ def test_up_deaths_down_and_up_again(compose: Compose) -> None:
         assert not compose.processes(service, "ray::RolloutActor")
     wait_for(lambda: query('max_over_time(liir_win_rate{actions="sampled"}[1h])') > 0, "a battle won")
 
+    # A service has the token of its role, and from outside it takes TLS and one, too.
+    for service, role in {"ray-worker": "actor", "actors": "actor", "evaluator": "evaluator"}.items():
+        assert re.fullmatch(rf"{role} \S+\n", compose("exec", service, "cat", "/certs/tokens"))
+    assert "no learner answered" in compose.run([LIIR, "status", "--learner", LEARNER], code=3)
+    compose.documented("Fetch a checkpoint")
+    first = compose.fetched()
+    assert "it takes operator" in compose.liir("stop", code=5)
+
     # A worker dies: its actors go elsewhere, the worker comes back.
     compose.kill("ray-worker", "raylet/raylet --")
     wait_for(lambda: compose.restarts("ray-worker") > 0, "the worker started again")
@@ -150,27 +211,49 @@ def test_up_deaths_down_and_up_again(compose: Compose) -> None:
     wait_for(lambda: query("liir_actors_connected") == ACTORS, "all actors connected again")
 
     # The learner dies: it goes on from its last save.
-    before = status().learner_step
+    before = compose.status().learner_step
     compose.kill("learner", "/venv/bin/liir learner")
     wait_for(lambda: compose.restarts("learner") > 0, "the learner started again")
-    wait_for(lambda: status().learner_step > before + 5, "learner steps after its death")
+    wait_for(lambda: compose.status().learner_step > before + 5, "learner steps after its death")
 
-    # A checkpoint is fetched from outside; a stop is graceful and nothing of it is lost.
-    with CheckpointClient(f"127.0.0.1:{LEARNER_PORT}") as client:
-        first, data = client.download(80)
-    stopped_at = status()
+    # New certificates are served at once, new tokens lock out whoever has the old ones; the run goes on.
+    certificate, secrets = served_certificate(), compose.secrets()
+    compose.documented("Renew the certificates")
+    assert served_certificate() != certificate
+    before = compose.status().learner_step
+    compose.documented("Replace the tokens")
+    wait_for(compose.serving, "the learner serves again")
+    assert "does not know the token" in compose.liir("status", code=5)
+    compose.documented("Fetch a checkpoint")
+    assert compose.fetched() == first
+    wait_for(lambda: compose.status().learner_step > before + 5, "learner steps with new tokens")
+    wait_for(lambda: query("liir_actors_connected") == ACTORS, "all actors connected with new tokens")
+
+    # A stop is graceful and nothing is lost; nor did a secret reach a log or a container's description.
+    stopped_at = compose.status()
     compose("stop")
-    containers = map(json.loads, compose("ps", "--all", "--format", "json").splitlines())
+    containers = [json.loads(line) for line in compose("ps", "--all", "--format", "json").splitlines()]
     exit_codes = {container["Service"]: container["ExitCode"] for container in containers}
-    assert [exit_codes[service] for service in ("learner", "actors", "evaluator")] == [0, 0, 0], exit_codes
-    compose("down")
+    ended = ("certs", "learner", "actors", "evaluator")
+    assert [exit_codes[service] for service in ended] == [0, 0, 0, 0], exit_codes
+    shown = compose("logs") + compose.run(["docker", "inspect", *(c["ID"] for c in containers)])
+    secrets |= compose.secrets()
+    assert len(secrets) > 30
+    assert not [secret for secret in secrets if secret in shown]
 
+    # Up again, from a copy of the runs and with another CA: the same checkpoint comes to who has the new one.
+    compose.documented("Back up")
+    compose("down")
+    compose.run(["docker", "volume", "rm", "liir-test_runs"])
+    compose.documented("Restore")
+    compose.documented("Replace the CA")
     compose.up()
-    resumed = status()
+    assert "CERTIFICATE_VERIFY_FAILED" in compose.liir("status", code=3)
+    compose.documented("Fetch a checkpoint")
+    assert compose.fetched() == first
+    resumed = compose.status()
     assert resumed.learner_step >= stopped_at.learner_step
     assert resumed.evaluations >= stopped_at.evaluations > 0
-    wait_for(lambda: status().learner_step > resumed.learner_step + 5, "learner steps after the resume")
-    with CheckpointClient(f"127.0.0.1:{LEARNER_PORT}") as client:
-        assert client.download(80) == (first, data)
+    wait_for(lambda: compose.status().learner_step > resumed.learner_step + 5, "steps after the resume")
     # Prometheus kept what it saw of the first learner.
     assert query("count(min_over_time(liir_learner_step[1h]) < 5)") == 1

@@ -16,7 +16,6 @@ from playwright.sync_api import Browser, Error, Page, expect, sync_playwright
 from liir_common.replay.load import load_checkpoint
 from liir_common.replay.record import Recording, record
 from liir_common.replay.write import write
-from liir_common.types import Exploration
 from tests.replays import publish
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
@@ -37,7 +36,7 @@ def browser() -> Iterator[Browser]:
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     checkpoint = publish(tmp_path_factory.mktemp("liir"))
-    return record(*load_checkpoint(checkpoint), seed=5, exploration=Exploration.SOFTMAX_FLOOR)
+    return record(*load_checkpoint(checkpoint), seed=5, sampled=True)
 
 
 @pytest.fixture(scope="module")

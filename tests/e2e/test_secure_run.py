@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import shutil
 import tempfile
 import urllib.request
@@ -34,9 +33,7 @@ def test_a_secure_run_lets_in_by_role_and_leaves_no_secret(
     printed = service.finish(service.start("certs", "-o", str(certs)))
     config = tmp_path / "secure.yaml"
     config.write_text(f"learner: {{host: 0.0.0.0}}\n{printed}")
-    tokens = (certs / "tokens").read_text()
-    for role in ("reader", "operator"):
-        (certs / role).write_text(re.search(f"{role} .*", tokens)[0])
+    tokens = (certs / "learner" / "tokens").read_text()
     # At first the tokens are in the environment, after the restart in the file that the configuration names.
     environment = ("security.tokens=''", "training.total_env_steps=1000000")
     outputs = [printed]
@@ -45,13 +42,11 @@ def test_a_secure_run_lets_in_by_role_and_leaves_no_secret(
         monkeypatch.delenv("LIIR_TOKENS")
         service.wait_for(lambda: (run_dir / "evaluations.csv").exists(), "the first evaluation")
         address = service.endpoints(run_dir)["address"]
-        client = {"cert": "client.pem", "key": "client-key.pem", "ca": "ca.pem", "tokens": "reader"}
 
-        def liir(*command: str, code: int = 0, **files: str) -> str:
-            named = {f"security.{key}": certs / name for key, name in (client | files).items() if name}
-            settings = [part for key, path in named.items() for part in ("--set", f"{key}={path}")]
-            started = service.start(*command, "--learner", address, *settings)
-            outputs.append(service.finish(started, code))
+        def liir(*command: str, code: int = 0, role: str = "reader", **files: str) -> str:
+            settings = [f"security={certs / role}", *(f"security.{k}='{name}'" for k, name in files.items())]
+            options = [part for setting in settings for part in ("--set", setting)]
+            outputs.append(service.finish(service.start(*command, "--learner", address, *options), code))
             return outputs[-1]
 
         assert '"actors": 2' in liir("status")
@@ -62,11 +57,11 @@ def test_a_secure_run_lets_in_by_role_and_leaves_no_secret(
         assert "got none; name a file" in liir("status", code=5, tokens="")
         metrics = service.endpoints(run_dir)["metrics"]
         outputs.append(urllib.request.urlopen(f"http://{metrics}/metrics", timeout=5).read().decode())
-        liir("stop", tokens="operator")
+        liir("stop", role="operator")
         outputs.append(service.finish(process))
     # The run keeps the names of the files, not what is in them.
     more = int(read_table(run_dir / "metrics.csv")[-1]["env_steps"]) + 1000
-    file = (f"training.total_env_steps={more}", f"security.tokens={certs / 'tokens'}")
+    file = (f"training.total_env_steps={more}", f"security.tokens={certs / 'learner' / 'tokens'}")
     outputs.append(service.train(run_dir, *file, options=["--resume"]))
     assert json.loads((run_dir / "summary.json").read_text())["evaluations"] > 0
 
@@ -85,7 +80,7 @@ def files_of(folder: Path) -> list[Path]:
 
 def secrets(certs: Path) -> list[bytes]:
     """Every token, and every line of every private key."""
-    found = [line.split()[1] for line in (certs / "tokens").read_bytes().splitlines()]
-    for file in certs.glob("*-key.pem"):
+    found = [line.split()[1] for line in (certs / "learner" / "tokens").read_bytes().splitlines()]
+    for file in certs.rglob("*key.pem"):
         found += [line for line in file.read_bytes().splitlines() if b"-----" not in line]
     return found

@@ -21,7 +21,7 @@ pytestmark = [pytest.mark.ray_submit, pytest.mark.timeout(1200)]
 
 ROOT = Path(__file__).parents[2]
 UPLOADED = ("liir_common", "services", "configs", "deploy")
-FILES = ("pyproject.toml", "requirements.txt", "README.md", "LICENSE")
+FILES = ("pyproject.toml", "requirements.txt", "requirements-torch.txt", "README.md", "LICENSE")
 ACTORS = 4
 RUN = "runs/test"
 SETTINGS = (
@@ -117,8 +117,8 @@ def learner_step(run_dir: Path) -> int:
 
 def secrets(certs: Path) -> list[str]:
     """Every token, and the second line of every private key."""
-    tokens = [line.split()[1] for line in (certs / "tokens").read_text().splitlines()]
-    return tokens + [key.read_text().splitlines()[1] for key in certs.glob("*-key.pem")]
+    tokens = [line.split()[1] for line in (certs / "learner" / "tokens").read_text().splitlines()]
+    return tokens + [key.read_text().splitlines()[1] for key in certs.rglob("*key.pem")]
 
 
 def test_up_submit_a_worker_lost_and_back_finish_down(cluster: Cluster, tmp_path: Path) -> None:
@@ -148,11 +148,8 @@ def test_up_submit_a_worker_lost_and_back_finish_down(cluster: Cluster, tmp_path
 
     # A stop is graceful; the run goes on under the same address and token, and is complete in the end.
     stopped_at = running()
-    liir = "~/liir-venv/bin/liir stop --learner"
     address = json.loads((run_dir / "endpoints.json").read_text())["address"]
-    keys = {"ca": "ca.pem", "cert": "client.pem", "key": "client-key.pem", "tokens": "tokens"}
-    client = " ".join(f"--set security.{key}=certs/test/{name}" for key, name in keys.items())
-    cluster.ray(f"exec {CLUSTER} '{liir} {address} {client}'")
+    cluster.ray(f"exec {CLUSTER} 'liir stop --learner {address} --set security=certs/test/operator'")
     assert submitted.wait(120) == 0, output.read_text(errors="replace")[-3000:]
     more = int(read_table(run_dir / "metrics.csv")[-1]["env_steps"]) + 2000
     submitted = cluster.submit(output, "--resume", f"--set training.total_env_steps={more}")
@@ -166,7 +163,7 @@ def test_up_submit_a_worker_lost_and_back_finish_down(cluster: Cluster, tmp_path
     store = CheckpointStore(str(fetched / "checkpoints"))
     assert [manifest.episode for manifest in store.manifests][:2] == [80, 160]
     ours = secrets(certs)
-    assert len(ours) > 6
+    assert len(ours) > 8
     patterns = " ".join(f"-e {secret}" for secret in ours)
     for machine, folders in (
         (cluster.head, "runs /tmp/ray"),

@@ -56,10 +56,9 @@ HEALTH = "/grpc.health.v1.Health/Check"
 
 
 def security(folder: Path, **files: str) -> SecurityConfig:
-    """The learner's section, as `liir certs` prints it, with other files if named."""
-    named = {"ca": "ca.pem", "client_ca": "ca.pem", "cert": "server.pem", "key": "server-key.pem"}
-    named |= {"tokens": "tokens"} | files
-    return SecurityConfig(**{key: str(folder / name) if name else "" for key, name in named.items()})
+    """The learner's section, as `liir certs` prints it, with other files of `folder` if named."""
+    named = [f"security.{key}='{folder / name if name else ''}'" for key, name in files.items()]
+    return load(None, [f"security={folder / 'learner'}", *named]).security
 
 
 @contextmanager
@@ -120,7 +119,7 @@ def ask_over(connection: grpc.Channel, method: str, metadata: Any = None) -> tup
 def test_each_role_reaches_its_methods_and_no_other(
     learner: str, certs: Path, index: int, role: Role
 ) -> None:
-    with channel.connect(learner, 10, security(certs), role) as connection:
+    with channel.connect(learner, 10, SecurityConfig.of(certs / role), role) as connection:
         for method, access in ACCESS.items():
             code, details = ask_over(connection, method)
             if access[index] == "x":
@@ -160,7 +159,7 @@ def test_without_a_token_only_health_answers(learner: str, certs: Path) -> None:
 def test_an_expired_token_is_refused_with_its_date(tmp_path: Path, certs: Path) -> None:
     folder = tmp_path / "certs"
     shutil.copytree(certs, folder)
-    (folder / "tokens").write_text(
+    (folder / "learner" / "tokens").write_text(
         f"reader {'a' * 40} 2020-02-29\nactor {'b' * 40} 2999-01-01T10:00+02:00 # new\n"
     )
     status = "/liir.v1.TrainingService/GetStatus"
@@ -174,10 +173,11 @@ def test_the_wrong_certificates_are_explained(learner: str, certs: Path, tmp_pat
     folder = tmp_path / "certs"
     shutil.copytree(certs, folder)
     make_certs(folder / "other")
+    pair = {"cert": "other/reader/cert.pem", "key": "other/reader/key.pem"}
     wrong = {
         "another CA": ({"ca": "other/ca.pem"}, "CERTIFICATE_VERIFY_FAILED"),
         "no client certificate": ({"cert": "", "key": "", "client_ca": ""}, "security.ca"),
-        "one of another CA": ({"cert": "other/client.pem", "key": "other/client-key.pem"}, "security.ca"),
+        "one of another CA": (pair, "security.ca"),
         "plaintext": (None, "security.ca"),
     }
     for case, (files, message) in wrong.items():
@@ -185,8 +185,6 @@ def test_the_wrong_certificates_are_explained(learner: str, certs: Path, tmp_pat
         with pytest.raises(UnreachableError) as caught:
             channel.connect(learner, 2, settings)
         assert message in str(caught.value), case
-    client = {"cert": "client.pem", "key": "client-key.pem"}
-    assert REACHED in ask(learner, "/liir.v1.TrainingService/GetStatus", security(folder, **client))[1]
 
 
 async def bind(host: str, settings: SecurityConfig, insecure: bool = False) -> None:
@@ -223,7 +221,7 @@ def test_a_client_never_sends_a_token_in_plaintext(monkeypatch: pytest.MonkeyPat
 def test_tokens_may_come_from_the_environment(
     learner: str, certs: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv(tokens.VARIABLE, (certs / "tokens").read_text())
+    monkeypatch.setenv(tokens.VARIABLE, (certs / "learner" / "tokens").read_text())
     settings = security(certs, tokens="")
     assert REACHED in ask(learner, "/liir.v1.TrainingService/Stop", settings, Role.OPERATOR)[1]
 
@@ -231,7 +229,7 @@ def test_tokens_may_come_from_the_environment(
 def test_tokens_rotate_without_a_restart(tmp_path: Path, certs: Path) -> None:
     folder = tmp_path / "certs"
     shutil.copytree(certs, folder)
-    file, method = folder / "tokens", "/liir.v1.TrainingService/GetStatus"
+    file, method = folder / "learner" / "tokens", "/liir.v1.TrainingService/GetStatus"
     (folder / "client").write_text(file.read_text())
     with (
         serving(security(folder)) as address,
@@ -258,13 +256,16 @@ def test_certificates_rotate_without_a_restart(tmp_path: Path, certs: Path) -> N
     with serving(security(folder, client_ca="")) as address:
         host, port = address.split(":")
         before = ssl.get_server_certificate((host, int(port)))
-        assert before.strip() == (certs / "server.pem").read_text().strip()
+        assert before.strip() == (certs / "learner" / "cert.pem").read_text().strip()
         make_certs(folder)
-        assert (folder / "ca.pem").read_text() == (certs / "ca.pem").read_text()
-        assert (folder / "tokens").read_text() == (certs / "tokens").read_text()
+        for name in ("ca.pem", "learner/tokens", "reader/tokens", "reader/ca.pem"):
+            assert (folder / name).read_text() == (certs / name).read_text()
         after = ssl.get_server_certificate((host, int(port)))
-        assert after.strip() == (folder / "server.pem").read_text().strip() != before.strip()
-        (folder / "server.pem").unlink()
+        assert after.strip() == (folder / "learner" / "cert.pem").read_text().strip() != before.strip()
+        # Between the two new files, and after a failed rotation: the last pair that was one.
+        (folder / "learner" / "key.pem").write_text((certs / "learner" / "key.pem").read_text())
+        assert ssl.get_server_certificate((host, int(port))) == after
+        (folder / "learner" / "cert.pem").unlink()
         assert ssl.get_server_certificate((host, int(port))) == after
 
 
@@ -274,7 +275,7 @@ def test_client_cas_rotate_without_a_restart(tmp_path: Path, certs: Path) -> Non
     make_certs(folder / "other")
     (folder / "clients.pem").write_text((folder / "other" / "ca.pem").read_text())
     old = security(folder)
-    new = security(folder, cert="other/client.pem", key="other/client-key.pem")
+    new = security(folder, cert="other/reader/cert.pem", key="other/reader/key.pem")
     with serving(security(folder, client_ca="clients.pem")) as address:
         with pytest.raises(UnreachableError):
             channel.connect(address, 1, old)
@@ -294,9 +295,28 @@ def test_metrics_are_served_on_loopback_unless_asked() -> None:
 
 
 def test_private_files_are_private(certs: Path) -> None:
-    for file in certs.iterdir():
-        private = file.name == "tokens" or file.name.endswith("-key.pem")
+    for file in filter(Path.is_file, certs.rglob("*")):
+        private = file.name in ("tokens", "key.pem", "ca-key.pem")
         assert file.stat().st_mode & 0o777 == (0o600 if private else 0o644), file
+
+
+def test_a_role_is_handed_its_own_tokens(tmp_path: Path) -> None:
+    make_certs(tmp_path)
+    tokens_file = tmp_path / "learner" / "tokens"
+    lines = tokens_file.read_text().splitlines()
+    for line, role in zip(lines, Role, strict=True):
+        assert (tmp_path / role / "tokens").read_text() == f"{line}\n"
+    new = f"reader {'n' * 40} 2999-01-01 # for a while\n"
+    tokens_file.write_text(new + "\n".join(lines))
+    make_certs(tmp_path)
+    assert (tmp_path / "reader" / "tokens").read_text() == f"{new}{lines[2]}\n"
+    tokens_file.unlink()
+    make_certs(tmp_path)
+    assert not set(lines) & set(tokens_file.read_text().splitlines())
+    assert (tmp_path / "actor" / "tokens").read_text() == tokens_file.read_text().splitlines(True)[0]
+    tokens_file.write_text("reader short\n")
+    with pytest.raises(ConfigError, match="tokens, line 1: wanted"):
+        make_certs(tmp_path)
 
 
 @pytest.mark.parametrize("name", ["cert", "key", "client_ca", "tokens"])

@@ -163,7 +163,7 @@ def test_spec_hash_follows_every_option() -> None:
     assert plain.version == SIMULATOR_VERSION
     assert plain.hash == battle_spec("3m", reward_win=200).hash, "a default that is written out"
     assert plain.hash != battle_spec("3m", slide=0.5).hash
-    assert json.loads(plain.options)["rescan_period"] == 6
+    assert json.loads(plain.options)["rescan_period"] == 8
 
 
 def test_snapshot_and_restore() -> None:

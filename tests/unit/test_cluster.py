@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 
 from liir_common.certs import make_certs
-from liir_common.config import SecurityConfig, load
+from liir_common.config import PLAINTEXT, SecurityConfig, load
 from liir_common.errors import ConfigError, LiirError
 from liir_common.launch import Request
 from liir_common.rpc import carry
 from liir_common.rpc.tokens import Role, Tokens
-from services.cluster.__main__ import learners_place, make_security
+from services.cluster.__main__ import learners_place, roles_security
 
 HEAD = {"CPU": 4.0, "node:10.0.0.1": 1.0, "node:__internal_head__": 1.0}
 WORKER = {"CPU": 8.0, "node:10.0.0.2": 1.0}
@@ -66,28 +66,40 @@ def test_a_resumed_run_goes_where_its_directory_is(tmp_path: Path) -> None:
 
 def test_carried_files_are_in_memory_and_hold_only_the_token_of_the_role(tmp_path: Path) -> None:
     make_certs(tmp_path)
-    tokens = Tokens(str(tmp_path / "tokens"))
-    _, client = make_security(tmp_path, "10.0.0.2")
-    carried = carry.unpack(carry.pack(client, Role.ACTOR))
-    assert Path(carried.ca).read_bytes() == (tmp_path / "ca.pem").read_bytes()
-    assert Path(carried.key).read_bytes() == (tmp_path / "client-key.pem").read_bytes()
+    learner = SecurityConfig.of(tmp_path / "learner")
+    tokens = Tokens(learner.tokens)
+    carried = carry.unpack(carry.pack(learner, Role.ACTOR))
+    assert Path(carried.key).read_bytes() == Path(learner.key).read_bytes()
     assert Tokens(carried.tokens).own(Role.OPERATOR) == tokens.own(Role.ACTOR)
-    everything = carry.unpack(carry.pack(client))
-    assert Tokens(everything.tokens).own(Role.OPERATOR) == tokens.own(Role.OPERATOR)
-    assert {path for path in carried.model_dump().values() if not path.startswith("/proc/")} == {""}
+    assert Tokens(carry.unpack(carry.pack(learner)).tokens).own(Role.OPERATOR) == tokens.own(Role.OPERATOR)
+    assert all(path.startswith("/proc/") for path in carried.model_dump().values())
     # A child, which the learner is, reads them by the same names.
     child = [sys.executable, "-c", "import sys; print(open(sys.argv[1]).read())", carried.ca]
     assert subprocess.run(child, capture_output=True, text=True, check=True).stdout.startswith("-----BEGIN")
 
 
-def test_the_certificate_for_a_node_is_made_again_and_its_tokens_stay(tmp_path: Path) -> None:
-    server, _ = make_security(tmp_path, "10.0.0.2")
-    before = carry.pack(server)
-    again, client = make_security(tmp_path, "10.0.0.3")
-    after = carry.pack(again)
-    assert after["tokens"] == before["tokens"]
-    assert after["cert"] != before["cert"]
-    assert not client.cert.endswith("server.pem")
+def test_each_role_has_its_own_and_another_address_keeps_the_tokens(tmp_path: Path) -> None:
+    before = roles_security(request(tmp_path), tmp_path / "certs", "10.0.0.2")
+    tokens, certificate = (
+        Path(before["learner"].tokens).read_text(),
+        Path(before["learner"].cert).read_text(),
+    )
+    after = roles_security(request(tmp_path), tmp_path / "certs", "10.0.0.3")
+    assert Path(after["learner"].tokens).read_text() == tokens
+    assert Path(after["learner"].cert).read_text() != certificate
+    assert len({security.key for security in after.values()}) == 1 + len(Role)
+
+
+def test_what_is_configured_is_used_by_all(tmp_path: Path) -> None:
+    make_certs(tmp_path)
+    learner = tmp_path / "learner"
+    for settings, security in (
+        ((f"security={learner}",), SecurityConfig.of(learner)),
+        (("learner.insecure=true",), PLAINTEXT),
+    ):
+        made = roles_security(request(tmp_path, *settings), tmp_path / "certs", "10.0.0.2")
+        assert set(made.values()) == {security}
+    assert not (tmp_path / "certs").exists()
 
 
 def test_a_file_that_cannot_be_sent_is_named() -> None:

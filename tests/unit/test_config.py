@@ -51,6 +51,26 @@ def test_env_may_be_its_kind(tmp_path: Path) -> None:
     assert config.load(None, ["env.map=8m"]).env.label == "8m"
 
 
+def test_security_may_be_the_folder_of_a_role(tmp_path: Path) -> None:
+    for role in ("reader", "actor"):
+        (tmp_path / role).mkdir()
+    file, reader = tmp_path / "run.yaml", str(tmp_path / "reader")
+    file.write_text(f"security: {reader}\n")
+    security = config.load(file).security
+    assert security == config.SecurityConfig.of(reader)
+    assert (security.ca, security.client_ca) == (f"{reader}/ca.pem", f"{reader}/ca.pem")
+    assert (security.cert, security.key, security.tokens) == tuple(
+        f"{reader}/{name}" for name in ("cert.pem", "key.pem", "tokens")
+    )
+    assert config.load(file, ["security.tokens=/own"]).security == security.model_copy(
+        update={"tokens": "/own"}
+    )
+    actor = config.SecurityConfig.of(tmp_path / "actor")
+    assert config.load(file, [f"security={tmp_path / 'actor'}"]).security == actor
+    with pytest.raises(ConfigError, match="wanted the folder of a role"):
+        config.load(None, [f"security={tmp_path / 'operator'}"])
+
+
 def test_presets_set_options_of_smacs_rules_only() -> None:
     settings = ["env=pettingzoo", "env.factory=games.pursuit:parallel_env", "env.options.horizon=9"]
     for preset in ("strong", "paper", "none"):
@@ -154,3 +174,11 @@ def test_a_kept_tree_is_all_there_is(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("LIIR_TRAINING__LAG", "1")
     assert config.from_tree({"seed": 2}).training.lag == 0
     assert config.load().training.lag == 1
+
+
+def test_a_section_in_the_environment_is_json_or_its_keys(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("LIIR_ENV", '{"map": "8m"}')
+    assert config.load().env.map == "8m"
+    monkeypatch.setenv("LIIR_ENV", "8m")
+    with pytest.raises(ConfigError, match=r'not JSON \(.*"env".*; set its keys, as in LIIR_ENV__MAP'):
+        config.load()

@@ -20,6 +20,7 @@ from liir_common import checkpoint
 from liir_common.battle.env import parallel_env
 from liir_common.cli import app
 from liir_common.errors import ConfigError, CorruptError
+from liir_common.replay import load
 from liir_common.replay.load import find_checkpoint, load_checkpoint
 from liir_common.replay.page import page_data, write_page
 from liir_common.replay.record import Recording, record, target_number
@@ -42,13 +43,13 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def sampled(run_dir: Path) -> Recording:
-    return record(*load_checkpoint(find_checkpoint(None, run_dir)), seed=5, exploration=SAMPLED)
+    return record(*load_checkpoint(find_checkpoint(None, run_dir)), seed=5, sampled=True)
 
 
 @pytest.mark.parametrize("exploration", [Exploration.GREEDY, SAMPLED])
 def test_the_battle_is_the_one_that_actors_play(run_dir: Path, exploration: Exploration) -> None:
     manifest, tensors = load_checkpoint(find_checkpoint(None, run_dir))
-    recording = record(manifest, tensors, 5, exploration)
+    recording = record(manifest, tensors, 5, exploration is SAMPLED)
     player = FusedPlayer("2s3z", dict(OPTIONS), HIDDEN)
     player.load(checkpoint.section(tensors, "policy"))
     ticket = Ticket(0, manifest.policy_version, 5, exploration, 0.0)
@@ -158,6 +159,39 @@ def test_a_method_without_intrinsic_reward_has_a_page_without_it(tmp_path: Path)
     assert {len(choice) for step in data["choices"] for agent in step for choice in agent} == {2}
 
 
+def test_a_value_based_method_shows_q_values_and_draws_as_its_tests_do(tmp_path: Path) -> None:
+    manifest, tensors = load_checkpoint(publish(tmp_path, method="iql"))
+    recording = record(manifest, tensors, seed=5, sampled=True)
+    player = FusedPlayer("2s3z", dict(OPTIONS), HIDDEN)
+    player.load(checkpoint.section(tensors, "policy"))
+    ticket = Ticket(0, manifest.policy_version, 5, Exploration.EPSILON_GREEDY, 0.05)
+    assert trajectories_equal(recording.trajectory, player.play(ticket))
+    assert recording.probabilities is None
+    assert recording.q_values is not None
+    assert recording.q_values.min() < 0, "Q values, not probabilities"
+    data = page_data(recording)
+    assert data["hasQ"]
+    action, q_value = data["choices"][0][0][-1]
+    assert q_value == pytest.approx(recording.q_values[0, 0, action], abs=1e-4)
+    greedy = record(manifest, tensors, seed=5)
+    best = np.where(greedy.trajectory.mask[:-1], greedy.q_values, -np.inf).argmax(-1)
+    assert np.array_equal(best, greedy.trajectory.actions)
+
+
+def test_another_version_of_the_simulator_is_warned_of(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recwarn: pytest.WarningsRecorder
+) -> None:
+    path = publish(tmp_path)
+    load_checkpoint(path)
+    assert not recwarn.list
+    monkeypatch.setattr(load, "SIMULATOR_VERSION", "999")
+    arguments = ["replay", "--checkpoint", str(path), "-o", str(tmp_path / "battle.html")]
+    with pytest.warns(
+        UserWarning, match=r"trained with version \S+ of the battle .* version 999 is installed"
+    ):
+        CliRunner().invoke(app, arguments, catch_exceptions=False)
+
+
 def test_animations_show_the_whole_battle(sampled: Recording, tmp_path: Path) -> None:
     few = replace(sampled, frames=sampled.frames[:5], shots=sampled.shots[:4])
     write(few, tmp_path / "battle.gif")
@@ -179,7 +213,8 @@ def test_animations_show_the_whole_battle(sampled: Recording, tmp_path: Path) ->
 def test_the_best_checkpoint_is_the_one_that_wins_most(run_dir: Path, tmp_path: Path) -> None:
     assert find_checkpoint(None, run_dir).stem == "checkpoint-000000300"
     (tmp_path / "evaluations.csv").write_text(
-        "episode,greedy_win_rate,sampled_win_rate\n100,0.9,1.0\n200,1.0,0.85\n900,1.0,0.8\n1000,0.95,1.0\n"
+        "episode,greedy_win_rate,sampled_win_rate,greedy_return_mean\n"
+        "100,0.9,1.0,20\n200,1.0,0.85,18\n300,1.0,0.85,17\n900,1.0,0.8,20\n1000,0.95,1.0,20\n"
     )
     assert find_checkpoint(None, tmp_path, best=True).stem == "checkpoint-000000200"
 

@@ -55,7 +55,9 @@ class Machine:
         """Start it and, unless it is the switch itself, plug it in."""
         kinds = ["--mount", "--pid", "--net", "--ipc", "--uts", "--propagation=private"]
         boot = ["sh", "-c", BOOT, "boot", str(self._folder), services]
-        self._process = subprocess.Popen(["unshare", *kinds, "--fork", "--kill-child", *boot])
+        # However this process ends, the machines end with it.
+        unshare = ["setpriv", "--pdeathsig", "KILL", "unshare", *kinds, "--fork", "--kill-child"]
+        self._process = subprocess.Popen([*unshare, *boot])
         while not self._first_process():
             assert self._process.poll() is None, "the machine does not start"
         if switch is None:

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import time
 from pathlib import Path
 
 import psutil
@@ -58,8 +59,9 @@ class Machine:
         # However this process ends, the machines end with it.
         unshare = ["setpriv", "--pdeathsig", "KILL", "unshare", *kinds, "--fork", "--kill-child"]
         self._process = subprocess.Popen([*unshare, *boot])
-        while not self._first_process():
+        while not self._on_own_disk():
             assert self._process.poll() is None, "the machine does not start"
+            time.sleep(0.01)
         if switch is None:
             self._ip("link add bridge0 type bridge")
             device = "bridge0"
@@ -103,6 +105,11 @@ class Machine:
             output = Path(file.name).read_text(errors="replace")
         assert code == 0, f"{command}: code {code}\n{output}"
         return output
+
+    def _on_own_disk(self) -> bool:
+        """Whether its first process has left the disk of this machine."""
+        roots = [Path(f"/proc/{first.pid}/root").readlink() for first in self._first_process()]
+        return roots == [self._folder / "root"]
 
     def _first_process(self) -> list[psutil.Process]:
         assert self._process is not None

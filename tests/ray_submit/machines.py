@@ -39,12 +39,13 @@ SSHD = "/usr/sbin/sshd -o PermitRootLogin=yes -o PasswordAuthentication=no -o Us
 
 
 class Machine:
-    """One machine; `home` is the home of its root while it is off or on."""
+    """One machine, on or off; `disk` has what it has written there, `home` is its root's home in it."""
 
     def __init__(self, folder: Path, number: int) -> None:
         """A machine that is off, with the files of this one on its disk."""
         self.address = f"{NETWORK}.{number}"
-        self.home = folder / "changes" / Path.home().relative_to("/")
+        self.disk = folder / "changes"
+        self.home = self.disk / Path.home().relative_to("/")
         self._folder = folder
         for name in ("changes", "work", "root"):
             (folder / name).mkdir(parents=True)

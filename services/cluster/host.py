@@ -17,6 +17,7 @@ from liir_common.rpc import carry
 log = structlog.get_logger()
 
 _ANSWER_S = END_S + 10.0
+_AWAY = (ray.exceptions.RayActorError, ray.exceptions.GetTimeoutError)
 _LOST = -signal.SIGKILL
 """Exit code of a process whose node is lost."""
 
@@ -114,23 +115,29 @@ class RemoteService(Service):
 
     def address(self) -> str | None:
         """Where it serves, once it does."""
-        address: str | None = ray.get(self._host.address.remote())
+        try:
+            address: str | None = ray.get(self._host.address.remote())
+        except ray.exceptions.RayActorError:  # of which `exit_code` tells
+            return None
         return address
 
     def last_words(self) -> str:
         """The end of its log."""
         if self._host is None:
             return "its node is lost"
-        return str(ray.get(self._host.last_words.remote(), timeout=_ANSWER_S))
+        try:
+            return str(ray.get(self._host.last_words.remote(), timeout=_ANSWER_S))
+        except _AWAY as error:
+            return f"its node does not answer: {error}"
 
     def end(self) -> None:
         """Ask it to end, insist after a while, and bring its files here."""
-        if self._asked is None:
+        if self._host is None or self._asked is None:
             return
         try:
             ray.get(self._host.end.remote(), timeout=_ANSWER_S)
             self.fetch("**/*")
-        except (ray.exceptions.RayActorError, ray.exceptions.GetTimeoutError) as error:
+        except _AWAY as error:
             log.warning(
                 "its node does not answer; its files stay there", service=self.name, reason=str(error)
             )

@@ -182,7 +182,8 @@ def test_up_submit_a_worker_lost_and_back_finish_down(cluster: Cluster, tmp_path
     leaks = [
         leak for machine in (cluster.user, cluster.head, cluster.worker) for leak in holding(machine, ours)
     ]
-    assert {Path(leak).parts[-4:-2] for leak in leaks} == {("certs", "test")}, leaks
+    assert leaks
+    assert not [leak for leak in leaks if not Path(leak).is_relative_to(certs)]
     assert not [secret for secret in ours if secret in output.read_text(errors="replace")]
 
     cluster.ray(f"down --yes {CLUSTER}")

@@ -53,7 +53,7 @@ def train(
     from liir_common import launch, logs
 
     logs.configure("train")
-    launch.train(launch.local, config, settings or (), run_dir, resume)
+    launch.train("liir train", launch.local, config, settings or (), run_dir, resume)
 
 
 def _run_service(name: str, context: typer.Context) -> None:

@@ -279,6 +279,7 @@ class Request:
 
 
 def train(
+    command: str,
     make_launcher: Callable[[Request], Launcher],
     file: Path | None,
     settings: Sequence[str],
@@ -286,6 +287,8 @@ def train(
     resume: bool,
 ) -> None:
     """Train with the launcher that is made for the request, and write and print the report.
+
+    `command` is what a person writes to train in this way.
 
     Raises:
         LiirError: the run cannot begin, or not go on.
@@ -297,7 +300,7 @@ def train(
     launcher.run(config.evaluation.enabled)
     print_summary(run_dir, write_report(run_dir))
     if launcher.stop_signal:
-        print(f"stopped early; go on with --resume --run-dir {run_dir}", file=sys.stderr)
+        print(f"stopped early; go on with: {command} --resume --run-dir {run_dir}", file=sys.stderr)
         raise SystemExit(128 + launcher.stop_signal)
 
 

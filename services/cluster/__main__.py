@@ -35,7 +35,8 @@ def train(
     resume = resume or (resume_if_begun and run_dir is not None and options.holds_run(run_dir))
     with exit_on_error():
         start_ray(ActorsConfig(ray_address="auto"))
-        launch.train(on_cluster, config, settings or (), run_dir, resume)
+        command = "ray submit deploy/cluster.yaml deploy/train.py --"
+        launch.train(command, on_cluster, config, settings or (), run_dir, resume)
 
 
 def on_cluster(request: launch.Request) -> launch.Launcher:

@@ -200,7 +200,9 @@ class CheckpointClient:
             except grpc.RpcError as error:
                 if error.code() not in AWAY:
                     raise LiirError(f"checkpoint {episode}: {error.details()}") from None
-            failures = failures + 1 if file.tell() == begin else 0
+            if file.tell() > begin:
+                failures, waits = 0, backoffs()
+            failures += 1
             time.sleep(next(waits))
         raise UnreachableError(f"checkpoint {episode}: the download broke {failures} times; try again later")
 

@@ -8,7 +8,7 @@ import grpc
 import structlog
 from google.protobuf.message import DecodeError
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
-from grpc_reflection.v1alpha import reflection
+from grpc_reflection.v1alpha import reflection, reflection_pb2
 
 from liir_common import metrics
 from liir_common.config import SecurityConfig
@@ -31,6 +31,7 @@ _OPTIONS = (
     # Two learners on one port would each get half of the actors.
     ("grpc.so_reuseport", 0),
 )
+_REFLECTION_V1 = "grpc.reflection.v1.ServerReflection"
 _MAX_REASON = 1000
 """Characters of an error message; it may quote what a peer sent."""
 _SERVICES = tuple(
@@ -143,8 +144,7 @@ class Server:
         self.local_address = f"{'127.0.0.1' if host == '0.0.0.0' else host}:{self.port}"
         self._health = health.aio.HealthServicer()
         health_pb2_grpc.add_HealthServicer_to_server(self._health, self.grpc)
-        names = (*_SERVICES, health.SERVICE_NAME, reflection.SERVICE_NAME)
-        reflection.enable_server_reflection(names, self.grpc)
+        _serve_reflection(self.grpc)
 
     async def start(self) -> None:
         """Serve, and say so to whoever asks for health."""
@@ -159,6 +159,19 @@ class Server:
     async def stop(self, grace_s: float) -> None:
         """End; streams still open after the grace are cut."""
         await self.grpc.stop(grace_s)
+
+
+def _serve_reflection(server: grpc.aio.Server) -> None:
+    """Version v1alpha, and v1, which newer clients ask for: the same messages under another name."""
+    names = (*_SERVICES, health.SERVICE_NAME, reflection.SERVICE_NAME)
+    reflection.enable_server_reflection(names, server)
+    handler = grpc.stream_stream_rpc_method_handler(
+        reflection.aio.ReflectionServicer(names).ServerReflectionInfo,
+        reflection_pb2.ServerReflectionRequest.FromString,
+        reflection_pb2.ServerReflectionResponse.SerializeToString,
+    )
+    handlers = {"ServerReflectionInfo": handler}
+    server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(_REFLECTION_V1, handlers),))
 
 
 def _check_exposure(host: str, insecure: bool, tls: bool, tokens: bool) -> None:

@@ -52,6 +52,7 @@ METHODS: Mapping[str, frozenset[Role]] = {
     "/liir.v1.TrainingService/GetStatus": frozenset({Role.READER, Role.OPERATOR}),
     "/liir.v1.TrainingService/Stop": frozenset({Role.OPERATOR}),
     "/grpc.reflection.v1alpha.ServerReflection/ServerReflectionInfo": _EVERY_ROLE,
+    "/grpc.reflection.v1.ServerReflection/ServerReflectionInfo": _EVERY_ROLE,
 }
 """Roles that may call a method; what is not listed, here or in PUBLIC, nobody may call."""
 PUBLIC = frozenset(f"/grpc.health.v1.Health/{method}" for method in ("Check", "List", "Watch"))

@@ -2,28 +2,37 @@
 
 from __future__ import annotations
 
+import base64
+import json
 import queue
+import re
 import socket
 from collections.abc import Callable, Iterator
 from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
 import grpc
 import numpy as np
 import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha.proto_reflection_descriptor_database import ProtoReflectionDescriptorDatabase
+from typer.testing import CliRunner
 
 from liir_common import checkpoint, seeds
 from liir_common.build import build
+from liir_common.cli import app
 from liir_common.client import CheckpointClient, TrainingClient
-from liir_common.errors import LiirError, UnreachableError
+from liir_common.errors import ConfigError, LiirError, UnreachableError
+from liir_common.policy import Policy
+from liir_common.replay.load import find_checkpoint
 from liir_common.rollout.play import make_player
 from liir_common.rpc import codec
 from liir_common.rpc.channel import CHANNEL_OPTIONS, connect
 from liir_common.rpc.gen.liir.v1 import checkpoint_pb2, rollout_pb2, rollout_pb2_grpc
 from liir_common.types import Ticket, policy_shapes
 from tests.e2e import service
+from tests.grpcurl import grpcurl, needs_grpcurl
 
 NO_STATS = rollout_pb2.ActorStats()
 PLAYER = service.config("env.map=3m")
@@ -246,6 +255,71 @@ def test_evaluations_are_stored_once(learner: tuple[str, Path]) -> None:
         with pytest.raises(grpc.RpcError) as caught:
             client.report(wrong)
         assert caught.value.code() == grpc.StatusCode.INVALID_ARGUMENT
+
+
+def report(client: CheckpointClient, episode: int, wins: int, return_mean: float) -> None:
+    frozen = client.find(episode)
+    stats = checkpoint_pb2.EpisodeStats(episodes=4, wins=wins, return_mean=return_mean)
+    evaluation = checkpoint_pb2.Evaluation(
+        episode=episode, sha256=frozen.sha256, env_steps=frozen.env_steps, greedy=stats, sampled=stats
+    )
+    assert client.report(evaluation)
+
+
+def test_the_commands_list_watch_rank_and_fetch(learner: tuple[str, Path], tmp_path: Path) -> None:
+    address, run_dir = learner
+
+    def checkpoints(command: str, *rest: str) -> list[str]:
+        arguments = ["checkpoints", command, "--learner", address, *rest]
+        return CliRunner().invoke(app, arguments, catch_exceptions=False).stdout.splitlines()
+
+    play_batches(address, 5)
+    with CheckpointClient(address) as client:
+        service.wait_for(lambda: len(list(client.list())) == 3, "three checkpoints")
+        with pytest.raises(LiirError, match="no checkpoint has been tested yet"):
+            checkpoints("best")
+        for episode, wins, return_mean in ((6, 3, 9.0), (12, 3, 10.0), (18, 2, 20.0)):
+            report(client, episode, wins, return_mean)
+        best = client.best()
+        sha256_of = {frozen.episode: frozen.sha256 for frozen in client.list()}
+    assert best.episode == 12
+    assert find_checkpoint(None, run_dir, best=True).stem == "checkpoint-000000012"
+    rows = [line.split() for line in checkpoints("list", "--map", "3m")]
+    assert {int(row[0]): row[4] for row in rows} == sha256_of
+    line, path = checkpoints("best", "--map", "3m", "-o", str(tmp_path / "best"))
+    assert line.split()[0] == "12"
+    assert line.endswith("won greedy 3/4, sampled 3/4; return 10.00")
+    (fetched,) = checkpoints("get", "12", "-o", str(tmp_path / "got"))
+    for file in (Path(path), Path(fetched)):
+        assert sha256(file.read_bytes()).hexdigest() == sha256_of[12]
+        Policy.load(file)
+        assert len(list(file.parent.iterdir())) == 2, "the weights, the manifest, and nothing else"
+    with pytest.raises(ConfigError, match=f"wanted a run on 8m; the learner at {address} trains on 3m"):
+        checkpoints("list", "--map", "8m")
+    with pytest.raises(LiirError, match="no checkpoint of episode 7"):
+        checkpoints("get", "7", "-o", str(tmp_path))
+
+
+@needs_grpcurl
+def test_grpcurl_needs_no_proto_files(learner: tuple[str, Path]) -> None:
+    address, run_dir = learner
+    play_batches(address, 2)
+
+    def ask(method: str, **request: object) -> list[dict[str, Any]]:
+        done = grpcurl("-plaintext", "-d", json.dumps(request), address, f"liir.v1.{method}")
+        assert done.returncode == 0, done.stderr
+        return [json.loads(text) for text in re.split(r"(?<=^})$", done.stdout, flags=re.M) if text.strip()]
+
+    described = grpcurl("-plaintext", address, "describe").stdout
+    assert "rpc GetCheckpoint" in described
+    assert "rpc Stop" in described
+    service.wait_for(lambda: bool(ask("CheckpointService/ListCheckpoints")[0]), "a checkpoint")
+    (listed,) = ask("CheckpointService/ListCheckpoints")[0]["checkpoints"]
+    assert listed["episode"] == "6"
+    header, *chunks = ask("CheckpointService/GetCheckpoint", episode=6, offset=10)
+    assert header["header"]["checkpoint"] == listed
+    stored = (run_dir / "checkpoints" / "checkpoint-000000006.safetensors").read_bytes()
+    assert b"".join(base64.b64decode(message["chunk"]) for message in chunks) == stored[10:]
 
 
 def test_health_and_reflection(learner: tuple[str, Path]) -> None:

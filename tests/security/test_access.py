@@ -34,6 +34,7 @@ from liir_common.rpc.gen.liir.v1 import (
 )
 from liir_common.rpc.server import Server
 from liir_common.rpc.tokens import Role
+from tests.grpcurl import grpcurl, needs_grpcurl
 
 DENIED, UNKNOWN = grpc.StatusCode.PERMISSION_DENIED, grpc.StatusCode.UNAUTHENTICATED
 REACHED = "Method not implemented!"
@@ -128,20 +129,33 @@ def test_each_role_reaches_its_methods_and_no_other(
                 assert code == DENIED, (method, code, details)
                 assert f"role {role} may not call this" in details
         assert ask_over(connection, HEALTH)[0] == grpc.StatusCode.OK
-        reflected = connection.stream_stream(
-            "/grpc.reflection.v1alpha.ServerReflection/ServerReflectionInfo",
-            reflection_pb2.ServerReflectionRequest.SerializeToString,
-            reflection_pb2.ServerReflectionResponse.FromString,
-        )(iter([reflection_pb2.ServerReflectionRequest(list_services="")]), timeout=10)
-        assert len(next(reflected).list_services_response.service) == 5
+        for version in ("v1alpha", "v1"):
+            reflected = connection.stream_stream(
+                f"/grpc.reflection.{version}.ServerReflection/ServerReflectionInfo",
+                reflection_pb2.ServerReflectionRequest.SerializeToString,
+                reflection_pb2.ServerReflectionResponse.FromString,
+            )(iter([reflection_pb2.ServerReflectionRequest(list_services="")]), timeout=10)
+            assert len(next(reflected).list_services_response.service) == 5
 
 
 def test_every_method_that_is_served_has_its_line_in_the_table() -> None:
     modules = (rollout_pb2, checkpoint_pb2, training_pb2, health_pb2, reflection_pb2)
     services = [s for module in modules for s in module.DESCRIPTOR.services_by_name.values()]
     served = {f"/{service.full_name}/{method.name}" for service in services for method in service.methods}
+    # The package grpcio-reflection has v1alpha alone, whose messages v1 shares.
+    served.add("/grpc.reflection.v1.ServerReflection/ServerReflectionInfo")
     assert served == set(tokens.METHODS) | tokens.PUBLIC
     assert not set(tokens.METHODS) & tokens.PUBLIC
+
+
+@needs_grpcurl
+def test_grpcurl_with_a_token(learner: str, certs: Path) -> None:
+    secret = tokens.Tokens(str(certs / "tokens")).own(Role.READER).secret
+    tls = ["-cacert", str(certs / "ca.pem"), "-cert", str(certs / "client.pem")]
+    tls += ["-key", str(certs / "client-key.pem")]
+    listed = grpcurl(*tls, "-H", f"authorization: Bearer {secret}", learner, "list")
+    assert "liir.v1.CheckpointService" in listed.stdout.split(), listed.stderr
+    assert "got none" in grpcurl(*tls, learner, "list").stderr
 
 
 def test_without_a_token_only_health_answers(learner: str, certs: Path) -> None:

@@ -13,6 +13,10 @@ from importlib import metadata
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+from tests.replays import publish
 
 ROOT = Path(__file__).parents[2]
 
@@ -41,17 +45,22 @@ def needed(names: list[str]) -> set[str]:
     """The distributions that come with those of `names`, themselves included."""
     found: set[str] = set()
     while names:
-        name = re.split(r"[^\w.-]", names.pop())[0].lower().replace("_", "-")
-        if name not in found:
+        requirement = Requirement(names.pop())
+        name, marker = canonicalize_name(requirement.name), requirement.marker
+        if name not in found and (marker is None or marker.evaluate({"extra": ""})):
             found.add(name)
-            names += [r for r in metadata.requires(name) or () if "extra ==" not in r]
+            names += metadata.requires(name) or ()
     return found
 
 
-def all_but_base_dependencies() -> set[str]:
-    """Top-level modules of everything installed that a plain `pip install` of the project would not bring."""
+def all_but_base_dependencies(*extras: str) -> set[str]:
+    """Top-level modules of everything installed that a `pip install` of the project would not bring.
+
+    Of the `extras` none may name another of the project's own.
+    """
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    base = needed(list(project["dependencies"])) | {project["name"]}
+    wanted = [name for extra in extras for name in project["optional-dependencies"][extra]]
+    base = needed([*project["dependencies"], *wanted]) | {project["name"]}
     return {
         module
         for module, distributions in metadata.packages_distributions().items()
@@ -77,6 +86,29 @@ def test_the_battle_needs_the_base_dependencies_alone() -> None:
     assert "enemy 2" in run(PLAY, blocked, ROOT)
     with pytest.raises(AssertionError, match="yaml is no base dependency"):
         run("import liir_common.config", blocked, ROOT)
+
+
+def test_the_client_and_its_policies_need_its_extra_alone(tmp_path: Path) -> None:
+    """A checkpoint is fetched and played without torch, Ray or what else the service has."""
+    blocked = all_but_base_dependencies("client")
+    assert blocked >= {"torch", "ray", "onnx", "matplotlib", "zstandard"}
+    path = publish(tmp_path, map_name="3m")
+    play = f"""
+import liir_common.client
+from liir_common.battle.env import parallel_env
+from liir_common.policy import Policy
+print(sum(1 for _ in Policy.load({str(path)!r}).play(parallel_env("3m"), seed=1)))
+"""
+    assert int(run(play, blocked, ROOT)) > 5
+
+
+def test_every_pinned_requirement_has_a_hash_and_no_file_names_a_registry() -> None:
+    for name in ("requirements.txt", "requirements-dev.txt"):
+        text = (ROOT / name).read_text()
+        pins = re.split(r"^(?=[a-z])", text, flags=re.M)[1:]
+        assert len(pins) > 40
+        assert all("==" in pin and "--hash=sha256:" in pin for pin in pins)
+        assert "://" not in text
 
 
 def test_the_wheel_holds_the_whole_package(tmp_path: Path) -> None:

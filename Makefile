@@ -61,7 +61,7 @@ PIN := UV_CUSTOM_COMPILE_COMMAND="make requirements" $(BIN)/uv pip compile --qui
 requirements: setup ## Pin what pyproject.toml asks for, with hashes (ARGS="--upgrade" takes new versions)
 	$(PIN) pyproject.toml --group build --extra service --extra animation --extra export -o requirements.txt
 	$(PIN) --group dev -c requirements.txt -o requirements-dev.txt
-	for image in actor learner; do $(PIN) pyproject.toml --group build --extra $$image -c requirements.txt \
+	for image in actor learner node; do $(PIN) pyproject.toml --group build --extra $$image -c requirements.txt \
 		-o deploy/requirements-$$image.txt || exit; done
 
 lint: setup ## Check style, types, import rules and generated code

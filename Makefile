@@ -50,6 +50,9 @@ test-monitoring: setup $(or $(shell command -v promtool),$(PROMETHEUS)/usr/bin/p
 test-compose: setup ## Run docker-compose.yml through deaths, stops and resumes; needs docker
 	$(BIN)/pytest -m compose $(ARGS)
 
+test-ray-submit: setup ## Run ray up, submit and down on three isolated machines; needs root, sshd, rsync and ip
+	$(BIN)/pytest -m ray_submit $(ARGS)
+
 dashboard: setup ## Write the Grafana dashboard from its program
 	$(BIN)/python deploy/grafana/dashboard.py > deploy/grafana/dashboards/liir.json
 
@@ -58,7 +61,7 @@ PIN := UV_CUSTOM_COMPILE_COMMAND="make requirements" $(BIN)/uv pip compile --qui
 requirements: setup ## Pin what pyproject.toml asks for, with hashes (ARGS="--upgrade" takes new versions)
 	$(PIN) pyproject.toml --group build --extra service --extra animation --extra export -o requirements.txt
 	$(PIN) --group dev -c requirements.txt -o requirements-dev.txt
-	for image in actor learner; do $(PIN) pyproject.toml --group build --extra $$image -c requirements.txt \
+	for image in actor learner node; do $(PIN) pyproject.toml --group build --extra $$image -c requirements.txt \
 		-o deploy/requirements-$$image.txt || exit; done
 
 lint: setup ## Check style, types, import rules and generated code
@@ -81,4 +84,4 @@ proto: setup ## Generate the gRPC code from proto/
 proto-check: proto
 	git diff --exit-code -- $(GEN)
 
-.PHONY: help setup train test browser fuzz test-monitoring test-compose dashboard requirements lint proto proto-check
+.PHONY: help setup train test browser fuzz test-monitoring test-compose test-ray-submit dashboard requirements lint proto proto-check

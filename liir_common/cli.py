@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import json
 import sys
-import time
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -51,42 +50,10 @@ def train(
     resume: options.Resume = False,
 ) -> None:
     """Train on this machine: a learner, Ray actors and an evaluator, until the run is complete."""
-    from liir_common import logs
-    from liir_common.launch import Launcher
+    from liir_common import launch, logs
 
     logs.configure("train")
-    path = run_dir or (_newest_run() if resume else None)
-    resolved = options.load_run_config(config, settings, path, resume)
-    path = path or Path("runs") / _run_name(resolved.env.label, resolved.algorithm.name, resolved.seed)
-    arguments = [] if config is None or resume else ["--config", str(config)]
-    arguments += [part for setting in settings or () for part in ("--set", setting)]
-    launcher = Launcher(path, arguments, resume, resolved.security)
-    summary = launcher.run(resolved.evaluation.enabled)
-    _print_summary(path, summary)
-    if launcher.stop_signal:
-        print(f"stopped early; go on with: liir train --resume --run-dir {path}", file=sys.stderr)
-        raise SystemExit(128 + launcher.stop_signal)
-
-
-def _run_name(env: str, algorithm: str, seed: int) -> str:
-    return f"{env}-{algorithm}-seed{seed}-{time.strftime('%Y%m%d-%H%M%S')}"
-
-
-def _newest_run() -> Path:
-    runs = sorted(Path("runs").glob("*/run.json"), key=lambda path: path.stat().st_mtime)
-    if not runs:
-        raise ConfigError("there is no run under runs/ to resume; name one with --run-dir")
-    return runs[-1].parent
-
-
-def _print_summary(run_dir: Path, summary: Any) -> None:
-    from dataclasses import asdict
-
-    print(f"\n{run_dir}")
-    for name, value in asdict(summary).items():
-        print(f"  {name.replace('_', ' '):30} {'–' if value is None else value}")
-    if summary.evaluations:
-        print(f"  curve: {run_dir / 'winrate.png'}")
+    launch.train("liir train", launch.local, config, settings or (), run_dir, resume)
 
 
 def _run_service(name: str, context: typer.Context) -> None:
@@ -289,12 +256,12 @@ def report(
     ] = None,
 ) -> None:
     """Write summary.json and winrate.png of each run again; with -o, gather the runs as results."""
-    from liir_common.report import write_report, write_results
+    from liir_common.report import print_summary, write_report, write_results
 
     for run_dir in run_dirs:
         if not (run_dir / "run.json").exists():
             raise ConfigError(f"{run_dir} holds no run")
-        _print_summary(run_dir, write_report(run_dir))
+        print_summary(run_dir, write_report(run_dir))
     if output is not None:
         write_results(run_dirs, output)
 

@@ -195,6 +195,8 @@ class ActorsConfig(Section):
     count: int = Field(32, ge=1)
     ray_address: str = ""
     """Ray cluster to join; empty starts one on this machine."""
+    send_security: bool = False
+    """Send the files of `security` to the actors through Ray; otherwise every node has them in its place."""
     compress: bool = False
     """Pack trajectories with zstd: a gain on slow links only."""
     ticket_timeout_s: float = Field(120.0, gt=0)

@@ -1,4 +1,4 @@
-"""`liir train`: learner, actors and evaluator as processes of this machine, started, watched, ended."""
+"""`liir train`: learner, actors and evaluator as processes, started, watched, ended."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ import signal
 import subprocess
 import sys
 import time
+from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 
@@ -18,11 +19,12 @@ import grpc
 import structlog
 from rich.console import Console
 
+from liir_common import options
 from liir_common.client import CheckpointClient, TrainingClient
-from liir_common.config import SecurityConfig
+from liir_common.config import Config, SecurityConfig
 from liir_common.display import Display, make_display
 from liir_common.errors import ConfigError, LiirError, RefusedError, UnreachableError
-from liir_common.report import Summary, write_report
+from liir_common.report import print_summary, write_report
 from liir_common.rpc.gen.liir.v1 import checkpoint_pb2
 from liir_common.rpc.tokens import Role
 
@@ -31,24 +33,65 @@ log = structlog.get_logger()
 _POLL_S = 0.25
 _START_S = 120.0
 _STOP_S = 60.0
+END_S = 10.0
+_LAST_LINES = 5
 _RESTARTS, _RESTARTS_WITHIN_S = 3, 300.0
 _PR_SET_PDEATHSIG = 1
 
 
-@dataclass
-class Service:
-    """One process of the run; its log is a file in the run directory."""
+class Service(ABC):
+    """One process of the run, wherever it is."""
 
-    name: str
-    arguments: list[str]
-    log_path: Path
-    process: subprocess.Popen[bytes] | None = None
-    restarts: deque[float] = field(default_factory=lambda: deque(maxlen=_RESTARTS))
+    def __init__(self, name: str, arguments: Sequence[str], run_dir: Path, log_name: str = "") -> None:
+        """Prepare `python -m services.NAME ARGUMENTS`; its log is a file in the run directory."""
+        self.name = name
+        self.arguments = list(arguments)
+        self.run_dir = run_dir
+        self.log_path = run_dir / "logs" / f"{log_name or name}.log"
+        self._restarts: deque[float] = deque(maxlen=_RESTARTS)
+
+    @abstractmethod
+    def start(self) -> None:
+        """Start it, or start it again."""
+
+    @property
+    @abstractmethod
+    def exit_code(self) -> int | None:
+        """None while it runs."""
+
+    @abstractmethod
+    def address(self) -> str | None:
+        """HOST:PORT that it serves at, once it does; only a learner ever does."""
+
+    @abstractmethod
+    def end(self) -> None:
+        """Ask it to end, and insist after a while."""
+
+    @abstractmethod
+    def last_words(self) -> str:
+        """The end of its log."""
+
+    def may_restart(self) -> bool:
+        """Whether another start makes sense: not after several deaths in a short time."""
+        if self.exit_code == UnreachableError.exit_code:  # which is another's fault, and took a while
+            return True
+        now = time.monotonic()
+        if len(self._restarts) == _RESTARTS and now - self._restarts[0] < _RESTARTS_WITHIN_S:
+            return False
+        self._restarts.append(now)
+        return True
+
+
+class LocalService(Service):
+    """A child of this process."""
+
+    _process: subprocess.Popen[bytes] | None = None
 
     def start(self) -> None:
         """Start it in a process group of its own, so that Ctrl-C reaches only the launcher."""
+        self.log_path.parent.mkdir(parents=True, exist_ok=True)
         with self.log_path.open("ab") as file:
-            self.process = subprocess.Popen(
+            self._process = subprocess.Popen(
                 [sys.executable, "-m", f"services.{self.name}", *self.arguments],
                 stdout=file,
                 stderr=file,
@@ -59,38 +102,38 @@ class Service:
 
     @property
     def exit_code(self) -> int | None:
-        """None while it runs."""
-        return self.process.poll() if self.process else None
+        """None while it runs, and before."""
+        return self._process.poll() if self._process else None
 
-    def end(self, timeout_s: float = 10.0) -> None:
+    def address(self) -> str | None:
+        """HOST:PORT that it serves at, once it does; not what an earlier one has left."""
+        path = self.run_dir / "endpoints.json"
+        if self._process is None or not path.exists():
+            return None
+        endpoints = json.loads(path.read_text())
+        return str(endpoints["address"]) if endpoints["pid"] == self._process.pid else None
+
+    def end(self) -> None:
         """Ask it to end, and insist after a while."""
-        if self.process is None or self.process.poll() is not None:
+        if self._process is None or self._process.poll() is not None:
             return
-        self.process.terminate()
+        self._process.terminate()
         try:
-            self.process.wait(timeout_s)
+            self._process.wait(END_S)
         except subprocess.TimeoutExpired:
             log.warning("does not end when asked; killed", service=self.name)
-            self.process.kill()
-            self.process.wait()
+            self._process.kill()
+            self._process.wait()
 
-    def last_words(self, lines: int = 5) -> str:
+    def last_words(self) -> str:
         """The end of its log."""
-        return "\n".join(self.log_path.read_text(errors="replace").splitlines()[-lines:])
-
-    def may_restart(self) -> bool:
-        """Whether another start makes sense: not after several deaths in a short time."""
-        now = time.monotonic()
-        if len(self.restarts) == _RESTARTS and now - self.restarts[0] < _RESTARTS_WITHIN_S:
-            return False
-        self.restarts.append(now)
-        return True
+        return "\n".join(self.log_path.read_text(errors="replace").splitlines()[-_LAST_LINES:])
 
 
-def _as_settings(security: SecurityConfig) -> list[str]:
-    """Arguments that give a process the same files; JSON strings are YAML."""
-    files = security.model_dump(exclude_defaults=True)
-    return [part for key, path in files.items() for part in ("--set", f"security.{key}={json.dumps(path)}")]
+def as_settings(security: SecurityConfig) -> list[str]:
+    """Arguments that give a process these files and no others; JSON strings are YAML."""
+    files = security.model_dump().items()
+    return [part for key, path in files for part in ("--set", f"security.{key}={json.dumps(path)}")]
 
 
 def die_with_parent() -> None:
@@ -100,26 +143,26 @@ def die_with_parent() -> None:
 
 
 class Launcher:
-    """The whole service on one machine, from start to summary."""
+    """The whole service, from start to end."""
 
     def __init__(
-        self, run_dir: Path, learner_arguments: Sequence[str], resume: bool, security: SecurityConfig
+        self,
+        run_dir: Path,
+        learner: Service,
+        actors: Service,
+        evaluator: Service,
+        security: SecurityConfig,
     ) -> None:
-        """Prepare to run in `run_dir`; the arguments are those of `liir learner`."""
+        """Prepare to run these processes; `security` is for clients of the learner."""
         self._run_dir = run_dir
+        self._learner = learner
+        self._actors = actors
+        self._evaluator = evaluator
         self._security = security
-        logs = run_dir / "logs"
-        logs.mkdir(parents=True, exist_ok=True)
-        arguments = ["--run-dir", str(run_dir), *learner_arguments]
-        self._learner = Service(
-            "learner", [*arguments, *(["--resume"] if resume else [])], logs / "learner.log"
-        )
-        self._actors = Service("actor", [], logs / "actors.log")
-        self._evaluator = Service("evaluator", [], logs / "evaluator.log")
         self._stop_signal = 0
 
-    def run(self, evaluate: bool) -> Summary:
-        """Train until the run is complete or a signal asks to stop; the summary is of what there is then.
+    def run(self, evaluate: bool) -> None:
+        """Train until the run is complete or a signal asks to stop.
 
         Raises:
             LiirError: a process cannot be kept running; the message has its last words.
@@ -132,7 +175,6 @@ class Launcher:
         finally:
             for service in (self._evaluator, self._actors, self._learner):
                 service.end()
-        return write_report(self._run_dir)
 
     @property
     def stop_signal(self) -> int:
@@ -143,24 +185,22 @@ class Launcher:
         self._stop_signal = signum
 
     def _start(self, evaluate: bool) -> str:
-        (self._run_dir / "endpoints.json").unlink(missing_ok=True)
         self._learner.start()
-        address = self._wait_for_endpoints()
+        address = self._wait_for_learner()
         # A learner that is started again must be found where it was.
         self._learner.arguments += ["--set", f"learner.port={address.rpartition(':')[2]}"]
         if "--resume" not in self._learner.arguments:
             self._learner.arguments.append("--resume")
         for service in (self._actors, self._evaluator) if evaluate else (self._actors,):
-            service.arguments += ["--learner", address, *_as_settings(self._security)]
+            service.arguments += ["--learner", address]
             service.start()
         return address
 
-    def _wait_for_endpoints(self) -> str:
-        path = self._run_dir / "endpoints.json"
+    def _wait_for_learner(self) -> str:
         deadline = time.monotonic() + _START_S
         while time.monotonic() < deadline:
-            if path.exists():
-                return str(json.loads(path.read_text())["address"])
+            if address := self._learner.address():
+                return address
             if self._learner.exit_code is not None:
                 self._raise_death(self._learner)
             time.sleep(_POLL_S / 5)
@@ -214,13 +254,78 @@ class Launcher:
 
     def _stop(self, training: TrainingClient) -> None:
         training.stop(f"signal {signal.Signals(self._stop_signal).name}")
-        assert self._learner.process is not None
-        try:
-            self._learner.process.wait(_STOP_S)
-        except subprocess.TimeoutExpired:
-            log.warning("the learner did not end in time", timeout_s=_STOP_S)
+        deadline = time.monotonic() + _STOP_S
+        while self._learner.exit_code is None:
+            if time.monotonic() > deadline:
+                log.warning("the learner did not end in time", timeout_s=_STOP_S)
+                return
+            time.sleep(_POLL_S)
 
     def _raise_death(self, service: Service) -> None:
         error = LiirError(f"the {service.name} ended with code {service.exit_code}:\n{service.last_words()}")
         error.exit_code = service.exit_code or 1
         raise error
+
+
+@dataclass(frozen=True)
+class Request:
+    """What `liir train` was asked for."""
+
+    run_dir: Path
+    config: Config
+    file: Path | None
+    settings: Sequence[str]
+    resume: bool
+
+
+def train(
+    command: str,
+    make_launcher: Callable[[Request], Launcher],
+    file: Path | None,
+    settings: Sequence[str],
+    run_dir: Path | None,
+    resume: bool,
+) -> None:
+    """Train with the launcher that is made for the request, and write and print the report.
+
+    `command` is what a person writes to train in this way.
+
+    Raises:
+        LiirError: the run cannot begin, or not go on.
+    """
+    run_dir = run_dir or (_newest_run() if resume else None)
+    config = options.load_run_config(file, list(settings), run_dir, resume)
+    run_dir = run_dir or Path("runs") / _run_name(config)
+    launcher = make_launcher(Request(run_dir, config, file, settings, resume))
+    launcher.run(config.evaluation.enabled)
+    print_summary(run_dir, write_report(run_dir))
+    if launcher.stop_signal:
+        print(f"stopped early; go on with: {command} --resume --run-dir {run_dir}", file=sys.stderr)
+        raise SystemExit(128 + launcher.stop_signal)
+
+
+def _run_name(config: Config) -> str:
+    now = time.strftime("%Y%m%d-%H%M%S")
+    return f"{config.env.label}-{config.algorithm.name}-seed{config.seed}-{now}"
+
+
+def _newest_run() -> Path:
+    runs = sorted(Path("runs").glob("*/run.json"), key=lambda path: path.stat().st_mtime)
+    if not runs:
+        raise ConfigError("there is no run under runs/ to resume; name one with --run-dir")
+    return runs[-1].parent
+
+
+def local(request: Request) -> Launcher:
+    """A launcher of processes of this machine, which share the run's files of `security`."""
+    source = ["--config", str(request.file)] if request.file and not request.resume else []
+    arguments = ["--run-dir", str(request.run_dir), *source, *(["--resume"] if request.resume else [])]
+    arguments += [part for setting in request.settings for part in ("--set", setting)]
+    client = as_settings(request.config.security)
+    return Launcher(
+        request.run_dir,
+        LocalService("learner", arguments, request.run_dir),
+        LocalService("actor", client, request.run_dir, "actors"),
+        LocalService("evaluator", client, request.run_dir),
+        request.config.security,
+    )

@@ -70,6 +70,15 @@ def write_report(run_dir: Path) -> Summary:
     return summary
 
 
+def print_summary(run_dir: Path, summary: Summary) -> None:
+    """Print the summary of the run in `run_dir` for a person to read."""
+    print(f"\n{run_dir}")
+    for name, value in asdict(summary).items():
+        print(f"  {name.replace('_', ' '):30} {'–' if value is None else value}")
+    if summary.evaluations:
+        print(f"  curve: {run_dir / 'winrate.png'}")
+
+
 def write_results(run_dirs: Sequence[Path], output: Path) -> None:
     """Gather runs into `output`: runs.csv (a row per run), curves.csv (a row per evaluation), winrate.png."""
     output.mkdir(parents=True, exist_ok=True)

@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import os
 import time
+from collections import Counter
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
 import ray
 import structlog
+from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from liir_common import metrics
 from liir_common.config import ActorsConfig, Config
 from liir_common.errors import LiirError, RefusedError
+from liir_common.rpc import carry
 from liir_common.rpc.channel import backoffs
+from liir_common.rpc.tokens import Role
 from services.actor.rollout_actor import RolloutActor
 
 log = structlog.get_logger()
@@ -32,8 +37,12 @@ class _Member:
     started: float = 0.0
     start_at: float = 0.0
     """When it is due to start, on the monotonic clock."""
+    actor: Any = None
+    """Its Ray actor; None while there is none."""
+    node: str = ""
+    """Ray's id of the actor's node."""
     ready: Any = None
-    """Reference that resolves when the actor is there; None once it did."""
+    """Reference that resolves to the node when the actor is there; None once it did."""
     run: Any = None
     """Reference that resolves when the actor ends; None while there is none."""
 
@@ -42,17 +51,23 @@ class Fleet:
     """Starts the actors and replaces those that die."""
 
     def __init__(self, address: str, config: Config) -> None:
-        """Play for the learner at `address`; Ray must be initialised."""
+        """Play for the learner at `address`; Ray must be initialised.
+
+        Raises:
+            ConfigError: a file of `security` is to be sent and cannot be read.
+        """
         self._address = address
         self._tree = config.tree()
-        # An actor waits more than it computes: it reserves so little that any number fits, spread evenly
-        # over the nodes, and yet none goes to a node without CPUs, which a cluster's head should be.
-        self._actor_class: Any = ray.remote(num_cpus=0.001, scheduling_strategy="SPREAD")(RolloutActor)
-        self._members = [_Member(f"actor-{i:03d}") for i in range(config.actors.count)]
+        self._files = carry.pack(config.security, Role.ACTOR) if config.actors.send_security else {}
+        # An actor waits more than it computes: it reserves so little that any number fits, and yet none goes
+        # to a node without CPUs, which a cluster's head may be.
+        self._actor_class: Any = ray.remote(num_cpus=0.001)(RolloutActor)
+        self._count = config.actors.count
+        self._members = [_Member(f"actor-{i:03d}") for i in range(self._count)]
         self._stopping = False
         self._waits = {member.name: backoffs() for member in self._members}
         # Starting is work for a core: one at a time on each, so that the first play while others start.
-        metrics.ACTORS_WANTED.set(config.actors.count)
+        metrics.ACTORS_WANTED.set(self._count)
         self._starting_at_once = max(1, int(ray.cluster_resources().get("CPU", 1)))
 
     def stop(self) -> None:
@@ -68,6 +83,8 @@ class Fleet:
         """
         while self._members and not self._stopping:
             starting = self._start_due()
+            if not starting and len(self._members) == self._count:  # nobody has been told to leave
+                self._even_out()
             metrics.ACTORS_ALIVE.set(sum(member.run is not None for member in self._members))
             self._collect_ended(_POLL_WHILE_STARTING_S if starting else _POLL_S)
 
@@ -76,6 +93,8 @@ class Fleet:
         starting = [member for member in self._members if member.ready is not None]
         for member in starting:
             if ray.wait([member.ready], timeout=0)[0]:
+                with suppress(ray.exceptions.RayActorError):  # which `run` has, too
+                    member.node = ray.get(member.ready)
                 member.ready = None
         now = time.monotonic()
         due = [member for member in self._members if member.run is None and member.start_at <= now]
@@ -87,8 +106,31 @@ class Fleet:
     def _start(self, member: _Member) -> None:
         member.incarnation += 1
         member.started = time.monotonic()
-        actor = self._actor_class.remote(member.name, member.incarnation, self._address, self._tree)
-        member.ready, member.run = actor.ready.remote(), actor.run.remote()
+        crowds = self._crowds()
+        member.node = min(crowds, key=lambda node: crowds[node], default="")
+        # Ray takes another node if that one is just being lost, and waits if there is none at all.
+        where = NodeAffinitySchedulingStrategy(member.node, soft=True) if member.node else "DEFAULT"
+        member.actor = self._actor_class.options(scheduling_strategy=where).remote(
+            member.name, member.incarnation, self._address, self._tree, self._files
+        )
+        member.ready, member.run = member.actor.ready.remote(), member.actor.run.remote()
+
+    def _even_out(self) -> None:
+        """Move one actor from the fullest node to the emptiest, which may be new or back."""
+        crowds = self._crowds()
+        if not crowds or max(crowds.values()) - min(crowds.values()) < 2:
+            return
+        fullest = max(crowds, key=lambda node: crowds[node])
+        member = next(m for m in self._members if m.node == fullest and m.actor is not None)
+        log.info("an actor moves to an emptier node", actor=member.name)
+        ray.kill(member.actor)
+        member.actor = member.run = None
+
+    def _crowds(self) -> dict[str, int]:
+        """How many actors there are on each node that has CPUs."""
+        placed = Counter(member.node for member in self._members if member.actor is not None)
+        nodes = [node for node in ray.nodes() if node["Alive"] and node["Resources"].get("CPU")]
+        return {node["NodeID"]: placed[node["NodeID"]] for node in nodes}
 
     def _collect_ended(self, timeout_s: float) -> None:
         running = {member.run: member for member in self._members if member.run is not None}
@@ -116,7 +158,7 @@ class Fleet:
             "an actor died; it is started again", actor=member.name, wait_s=round(wait, 2), error=str(error)
         )
         metrics.ACTOR_RESTARTS.inc()
-        member.ready = member.run = None
+        member.actor = member.ready = member.run = None
         member.start_at = now + wait
 
 

@@ -6,9 +6,10 @@ import queue
 import resource
 import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import grpc
+import ray
 import structlog
 
 from liir_common import logs, types
@@ -17,7 +18,7 @@ from liir_common.config import Config, from_tree
 from liir_common.errors import RefusedError
 from liir_common.rollout.play import make_player
 from liir_common.rollout.player import Player
-from liir_common.rpc import channel, codec
+from liir_common.rpc import carry, channel, codec
 from liir_common.rpc.gen.liir.v1 import rollout_pb2, rollout_pb2_grpc
 from liir_common.rpc.tokens import Role
 
@@ -29,19 +30,30 @@ _RETRIED = (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.CANCELLED)
 class RolloutActor:
     """Plays for a learner until the run is complete; made a Ray actor by the driver."""
 
-    def __init__(self, name: str, incarnation: int, address: str, config_tree: dict[str, object]) -> None:
-        """Get ready to play; nothing is asked for yet."""
+    def __init__(
+        self,
+        name: str,
+        incarnation: int,
+        address: str,
+        config_tree: dict[str, object],
+        files: Mapping[str, bytes],
+    ) -> None:
+        """Get ready to play; nothing is asked for yet.
+
+        `files` are those of `security` if the driver sends them; if not, this node's own are used.
+        """
         logs.configure(name)
         self._hello = (name, incarnation)
         self._address = address
         config: Config = from_tree(config_tree)
-        self._security = config.security
+        self._security = carry.unpack(files) if files else config.security
         self._compress = config.actors.compress
         self._player: Player = make_player(config.env, config.algorithm.policy_hidden)
         self._shapes = types.policy_shapes(self._player.spec, config.algorithm.policy_hidden)
 
-    def ready(self) -> None:
-        """Answers once the actor is there."""
+    def ready(self) -> str:
+        """Ray's id of the node that the actor is on, once it is there."""
+        return str(ray.get_runtime_context().get_node_id())
 
     def run(self) -> None:
         """Play until the learner says that the run is complete.

@@ -1,0 +1,195 @@
+"""deploy/cluster.yaml as a user runs it: up, submit, a worker lost and back, finish, down. Needs root."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import yaml
+
+from liir_common.checkpoint import CheckpointStore
+from liir_common.files import read_table
+from tests.ray_submit.machines import SSHD, Machine
+
+pytestmark = [pytest.mark.ray_submit, pytest.mark.timeout(1200)]
+
+ROOT = Path(__file__).parents[2]
+UPLOADED = ("liir_common", "services", "configs", "deploy")
+FILES = ("pyproject.toml", "requirements.txt", "requirements-torch.txt", "README.md", "LICENSE")
+ACTORS = 4
+RUN = "runs/test"
+SETTINGS = (
+    f"actors.count={ACTORS}",
+    "training.total_env_steps=100000000",
+    "training.batch_episodes=8",
+    "training.checkpoint_interval=80",
+    "evaluation.episodes=2",
+    "learner.threads=1",
+)
+CLUSTER, TRAIN = "deploy/cluster.yaml", "deploy/train.py"
+
+
+class Cluster:
+    """The user's machine, in the project's folder; a head and a worker with a key of the user's."""
+
+    def __init__(self, folder: Path) -> None:
+        """All three on, no Ray yet."""
+        self.user, self.head, self.worker = (
+            Machine(folder / name, number) for number, name in enumerate(("user", "head", "worker"), start=1)
+        )
+        self._give_project()
+        self._give_keys()
+        self.user.boot("true", None)
+        for machine in (self.head, self.worker):
+            (machine.home / "liir-venv").symlink_to(sys.prefix)
+            machine.boot(SSHD, self.user)
+
+    def end(self) -> None:
+        """All three off."""
+        for machine in (self.worker, self.head, self.user):
+            machine.lose()
+
+    def ray(self, command: str) -> str:
+        """Run `ray COMMAND` in the project's folder on the user's machine; returns its output."""
+        return self.user.run(f"cd liir && ray {command}")
+
+    def submit(self, output: Path, *arguments: str) -> subprocess.Popen[bytes]:
+        """Begin `ray submit … -- ARGUMENTS`."""
+        settings = " ".join(f"--set {setting}" for setting in SETTINGS)
+        command = f"ray submit {CLUSTER} {TRAIN} -- --run-dir {RUN} {settings} {' '.join(arguments)}"
+        return self.user.start(f"cd liir && {command}", output)
+
+    def _give_project(self) -> None:
+        folder = self.user.home / "liir"
+        for name in UPLOADED:
+            shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
+        for name in FILES:
+            shutil.copy(ROOT / name, folder)
+        cluster = yaml.safe_load((ROOT / CLUSTER).read_text())
+        cluster["provider"] |= {"head_ip": self.head.address, "worker_ips": [self.worker.address]}
+        cluster["auth"]["ssh_user"] = "root"
+        # They reach no registry, and have this machine's packages instead.
+        cluster["setup_commands"] = [line for line in cluster["setup_commands"] if " -r " not in line]
+        assert any("--no-deps" in line for line in cluster["setup_commands"])
+        (folder / CLUSTER).write_text(yaml.safe_dump(cluster))
+
+    def _give_keys(self) -> None:
+        for machine in (self.user, self.head, self.worker):
+            (machine.home / ".ssh").mkdir(mode=0o700)
+        key = self.user.home / ".ssh" / "id_ed25519"
+        subprocess.run(["ssh-keygen", "-q", "-N", "", "-t", "ed25519", "-f", str(key)], check=True)
+        for machine in (self.head, self.worker):
+            shutil.copy(f"{key}.pub", machine.home / ".ssh" / "authorized_keys")
+
+
+@pytest.fixture
+def cluster(tmp_path: Path) -> Iterator[Cluster]:
+    """Three machines that are on."""
+    cluster = Cluster(tmp_path)
+    try:
+        yield cluster
+    finally:
+        cluster.end()
+
+
+def wait_for(condition: Callable[[], object], what: str, timeout_s: float = 300.0) -> None:
+    """Poll until `condition` holds."""
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline, f"{what}: not within {timeout_s:g} s"
+        time.sleep(1)
+
+
+def processes(machine: Machine, command: str) -> int:
+    """How many processes of the machine have a command line that contains `command`."""
+    return len(machine.run(f"pgrep -f '[{command[0]}]{command[1:]}' || true").split())
+
+
+def learner_step(run_dir: Path) -> int:
+    """The newest learner step of the run."""
+    rows = read_table(run_dir / "metrics.csv")
+    return int(rows[-1]["learner_step"]) if rows else 0
+
+
+def secrets(certs: Path) -> list[str]:
+    """Every token, and the second line of every private key."""
+    tokens = [line.split()[1] for line in (certs / "learner" / "tokens").read_text().splitlines()]
+    return tokens + [key.read_text().splitlines()[1] for key in certs.rglob("*key.pem")]
+
+
+def holding(machine: Machine, texts: list[str]) -> list[str]:
+    """Files that the machine has written, to its disk or /tmp, with one of the texts in them."""
+    search = [
+        "grep",
+        "--recursive",
+        "--files-with-matches",
+        "--fixed-strings",
+        *(f"--regexp={text}" for text in texts),
+    ]
+    found = subprocess.run([*search, str(machine.disk)], stdout=subprocess.PIPE, text=True).stdout
+    return (found + machine.run(f"{' '.join(search)} /tmp || true")).split()
+
+
+def test_up_submit_a_worker_lost_and_back_finish_down(cluster: Cluster, tmp_path: Path) -> None:
+    cluster.ray(f"up --yes {CLUSTER}")
+    run_dir, certs = cluster.head.home / RUN, cluster.head.home / "certs" / "test"
+    output = tmp_path / "submit.log"
+    submitted = cluster.submit(output, "--config configs/3m.yaml")
+
+    def running() -> int:
+        assert submitted.poll() is None, output.read_text(errors="replace")[-3000:]
+        return learner_step(run_dir)
+
+    # The learner and the evaluator are children of Ray actors, the rollout actors sit on both machines.
+    wait_for(lambda: running() > 0, "the first learner step", 600)
+    assert processes(cluster.head, "services.learner") == 1
+    assert processes(cluster.head, "ray::Host") + processes(cluster.worker, "ray::Host") == 2
+    wait_for(lambda: actors(cluster) == (ACTORS // 2, ACTORS // 2), "actors on both machines")
+    wait_for(lambda: (run_dir / "evaluations.csv").exists(), "the first evaluation")
+
+    # The worker is lost: the head plays on alone. It is back: Ray sets it up again, actors move there.
+    cluster.worker.lose()
+    lost_at = running()
+    wait_for(lambda: running() > lost_at + 3, "learner steps without the worker")
+    wait_for(lambda: processes(cluster.head, "ray::RolloutActor") == ACTORS, "all actors on the head")
+    cluster.worker.boot(SSHD, cluster.user)
+    wait_for(lambda: running() and actors(cluster) == (ACTORS // 2, ACTORS // 2), "actors on both again", 600)
+
+    # A stop is graceful; the run goes on under the same address and token, and is complete in the end.
+    stopped_at = running()
+    address = json.loads((run_dir / "endpoints.json").read_text())["address"]
+    cluster.ray(f"exec {CLUSTER} 'liir stop --learner {address} --set security=certs/test/operator'")
+    assert submitted.wait(120) == 0, output.read_text(errors="replace")[-3000:]
+    more = int(read_table(run_dir / "metrics.csv")[-1]["env_steps"]) + 2000
+    submitted = cluster.submit(output, "--resume", f"--set training.total_env_steps={more}")
+    assert submitted.wait(400) == 0, output.read_text(errors="replace")[-3000:]
+    assert learner_step(run_dir) > stopped_at
+    assert json.loads((run_dir / "summary.json").read_text())["evaluations"] > 0
+
+    # What is fetched is the run; no secret is in it, in what was printed or in what Ray wrote.
+    cluster.ray(f"rsync-down {CLUSTER} '~/runs/' runs/")
+    fetched = cluster.user.home / "liir" / RUN
+    store = CheckpointStore(str(fetched / "checkpoints"))
+    assert [manifest.episode for manifest in store.manifests][:2] == [80, 160]
+    ours = secrets(certs)
+    assert len(ours) > 8
+    leaks = [
+        leak for machine in (cluster.user, cluster.head, cluster.worker) for leak in holding(machine, ours)
+    ]
+    assert leaks
+    assert not [leak for leak in leaks if not Path(leak).is_relative_to(certs)]
+    assert not [secret for secret in ours if secret in output.read_text(errors="replace")]
+
+    cluster.ray(f"down --yes {CLUSTER}")
+    assert processes(cluster.head, "raylet") == 0
+
+
+def actors(cluster: Cluster) -> tuple[int, int]:
+    """How many rollout actors there are on the head and on the worker."""
+    return processes(cluster.head, "ray::RolloutActor"), processes(cluster.worker, "ray::RolloutActor")

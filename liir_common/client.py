@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from liir_common.checkpoint import Manifest, unpack
 from liir_common.config import PLAINTEXT, Config, SecurityConfig, from_tree, merge, parse_settings
-from liir_common.errors import LiirError, RefusedError, UnreachableError
+from liir_common.errors import LiirError, MissingError, RefusedError, UnreachableError
 from liir_common.rpc.channel import DEADLINE_S, connect
 from liir_common.rpc.gen.liir.v1 import (
     checkpoint_pb2,
@@ -89,7 +89,8 @@ class CheckpointClient:
         """Manifest and weights file of one checkpoint; a broken download goes on where it broke.
 
         Raises:
-            LiirError: there is no such checkpoint, or the learner's copy is damaged.
+            MissingError: there is no such checkpoint, or it was deleted.
+            LiirError: the learner's copy is damaged.
             UnreachableError: the connection kept breaking.
             CorruptError: the bytes that came do not have the manifest's digest.
         """
@@ -99,7 +100,8 @@ class CheckpointClient:
                 manifest = self._download_rest(episode, data)
             except grpc.RpcError as error:
                 if error.code() not in AWAY:
-                    raise LiirError(f"checkpoint {episode}: {error.details()}") from None
+                    kind = MissingError if error.code() == grpc.StatusCode.NOT_FOUND else LiirError
+                    raise kind(f"checkpoint {episode}: {error.details()}") from None
                 continue
             unpack(bytes(data), manifest.sha256)
             return manifest, bytes(data)

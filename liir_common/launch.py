@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -20,8 +21,16 @@ from rich.console import Console
 
 from liir_common.client import CheckpointClient, TrainingClient
 from liir_common.config import SecurityConfig
-from liir_common.display import Display, make_display
-from liir_common.errors import ConfigError, LiirError, RefusedError, UnreachableError
+from liir_common.display import Display, make_display, phase_name
+from liir_common.errors import (
+    ConfigError,
+    LiirError,
+    RefusedError,
+    StorageError,
+    UnreachableError,
+    meaning,
+    storage_explained,
+)
 from liir_common.report import Summary, write_report
 from liir_common.rpc.gen.liir.v1 import checkpoint_pb2
 from liir_common.rpc.tokens import Role
@@ -33,6 +42,12 @@ _START_S = 120.0
 _STOP_S = 60.0
 _RESTARTS, _RESTARTS_WITHIN_S = 3, 300.0
 _PR_SET_PDEATHSIG = 1
+_LAST_LINES = 5
+_IN_VAIN = (ConfigError.exit_code, RefusedError.exit_code, StorageError.exit_code)
+"""Codes of processes that would only end in the same way again."""
+_EVENT = re.compile(r'"event": "([^"]*)"')
+_EXCEPTION = re.compile(r"^(?:error: |[\w.]*(?:Error|Exception)\b).*$", re.MULTILINE)
+"""The line of a log that has the type and the message, as `exit_on_error` or Python writes it."""
 
 
 @dataclass
@@ -44,12 +59,23 @@ class Service:
     log_path: Path
     process: subprocess.Popen[bytes] | None = None
     restarts: deque[float] = field(default_factory=lambda: deque(maxlen=_RESTARTS))
+    phase: str = ""
+    """What it said last that it was doing; only the learner is asked."""
+    _log_begin: int = 0
+    """Where in the log the present incarnation begins."""
+
+    @property
+    def command(self) -> list[str]:
+        """What starts it."""
+        return [sys.executable, "-m", f"services.{self.name}", *self.arguments]
 
     def start(self) -> None:
         """Start it in a process group of its own, so that Ctrl-C reaches only the launcher."""
+        self.phase = ""
         with self.log_path.open("ab") as file:
+            self._log_begin = file.tell()
             self.process = subprocess.Popen(
-                [sys.executable, "-m", f"services.{self.name}", *self.arguments],
+                self.command,
                 stdout=file,
                 stderr=file,
                 stdin=subprocess.DEVNULL,
@@ -74,9 +100,18 @@ class Service:
             self.process.kill()
             self.process.wait()
 
-    def last_words(self, lines: int = 5) -> str:
-        """The end of its log."""
-        return "\n".join(self.log_path.read_text(errors="replace").splitlines()[-lines:])
+    def obituary(self) -> str:
+        """How it ended, its last phase and exception, and the end of its log."""
+        code = self.exit_code or 0
+        how = signal.Signals(-code).name if code < 0 else meaning(code)
+        log_text = self.log_path.read_bytes()[self._log_begin :].decode(errors="replace")
+        phase = self.phase or (_EVENT.findall(log_text) or ["starting"])[-1]
+        exceptions = _EXCEPTION.findall(log_text) or ["none in its log"]
+        lines = "\n".join(log_text.splitlines()[-_LAST_LINES:])
+        return (
+            f"the {self.name} ended with code {code} ({how}) in the phase {phase!r}; "
+            f"last exception: {exceptions[-1]}; {self.log_path} ends with\n{lines}"
+        )
 
     def may_restart(self) -> bool:
         """Whether another start makes sense: not after several deaths in a short time."""
@@ -122,7 +157,7 @@ class Launcher:
         """Train until the run is complete or a signal asks to stop; the summary is of what there is then.
 
         Raises:
-            LiirError: a process cannot be kept running; the message has its last words.
+            LiirError: a process cannot be kept running; the message says how it ended.
         """
         for signum in (signal.SIGINT, signal.SIGTERM):
             signal.signal(signum, self._on_signal)
@@ -132,7 +167,8 @@ class Launcher:
         finally:
             for service in (self._evaluator, self._actors, self._learner):
                 service.end()
-        return write_report(self._run_dir)
+        with storage_explained(self._run_dir):
+            return write_report(self._run_dir)
 
     @property
     def stop_signal(self) -> int:
@@ -164,7 +200,9 @@ class Launcher:
             if self._learner.exit_code is not None:
                 self._raise_death(self._learner)
             time.sleep(_POLL_S / 5)
-        raise LiirError(f"the learner did not start within {_START_S:g} s:\n{self._learner.last_words()}")
+        raise LiirError(
+            f"the learner did not start within {_START_S:g} s; {self._learner.log_path} says what it does"
+        )
 
     def _watch(self, address: str) -> None:
         console = Console(stderr=True)
@@ -197,7 +235,9 @@ class Launcher:
     ) -> None:
         try:
             shown.extend(checkpoints.evaluations(shown[-1].episode if shown else 0))
-            display.show(training.status(), shown)
+            status = training.status()
+            self._learner.phase = phase_name(status)
+            display.show(status, shown)
         except grpc.RpcError as error:
             log.info("the learner does not answer", reason=error.details())
 
@@ -207,20 +247,26 @@ class Launcher:
             code = service.exit_code
             if code in (None, 0):
                 continue
-            if code in (ConfigError.exit_code, RefusedError.exit_code) or not service.may_restart():
+            if code in _IN_VAIN or not service.may_restart():
                 self._raise_death(service)
-            log.error("a process died; it is started again", service=service.name, exit_code=code)
+            log.error("a process died; it is started again", reason=service.obituary())
             service.start()
 
     def _stop(self, training: TrainingClient) -> None:
-        training.stop(f"signal {signal.Signals(self._stop_signal).name}")
         assert self._learner.process is not None
+        try:
+            training.stop(f"signal {signal.Signals(self._stop_signal).name}")
+        except grpc.RpcError as error:
+            log.info("the learner does not answer; told by signal to end", reason=error.details())
+            self._learner.process.terminate()
         try:
             self._learner.process.wait(_STOP_S)
         except subprocess.TimeoutExpired:
             log.warning("the learner did not end in time", timeout_s=_STOP_S)
+        if self._learner.exit_code:
+            self._raise_death(self._learner)
 
     def _raise_death(self, service: Service) -> None:
-        error = LiirError(f"the {service.name} ended with code {service.exit_code}:\n{service.last_words()}")
+        error = LiirError(service.obituary())
         error.exit_code = service.exit_code or 1
         raise error

@@ -32,6 +32,8 @@ class _Member:
     started: float = 0.0
     start_at: float = 0.0
     """When it is due to start, on the monotonic clock."""
+    actor: Any = None
+    """The Ray actor that fills it, or filled it last."""
     ready: Any = None
     """Reference that resolves when the actor is there; None once it did."""
     run: Any = None
@@ -87,8 +89,8 @@ class Fleet:
     def _start(self, member: _Member) -> None:
         member.incarnation += 1
         member.started = time.monotonic()
-        actor = self._actor_class.remote(member.name, member.incarnation, self._address, self._tree)
-        member.ready, member.run = actor.ready.remote(), actor.run.remote()
+        member.actor = self._actor_class.remote(member.name, member.incarnation, self._address, self._tree)
+        member.ready, member.run = member.actor.ready.remote(), member.actor.run.remote()
 
     def _collect_ended(self, timeout_s: float) -> None:
         running = {member.run: member for member in self._members if member.run is not None}
@@ -108,6 +110,8 @@ class Fleet:
                 self._members.remove(member)
 
     def _died(self, member: _Member, error: Exception) -> None:
+        # Ray also calls an actor dead that it cannot reach for a moment; left alone, it would play on.
+        ray.kill(member.actor)
         now = time.monotonic()
         if now - member.started > _QUICK_DEATH_S:
             self._waits[member.name] = backoffs()

@@ -47,6 +47,14 @@ test-monitoring: setup $(or $(shell command -v promtool),$(PROMETHEUS)/usr/bin/p
 test-compose: setup ## Run docker-compose.yml through deaths, stops and resumes; needs docker
 	$(BIN)/pytest -m compose $(ARGS)
 
+# As root in a namespace of its own where one is not root, since the tests mount a small disk.
+test-faults: setup ## Run the fault tests: a hundred faults in one training, and more
+	$(if $(filter 0,$(shell id -u)),,unshare --map-root-user --mount) $(BIN)/pytest -m faults $(ARGS)
+
+MINUTES ?= 5
+soak: setup ## Train for MINUTES and say whether memory, descriptors, threads or streams grow
+	$(BIN)/python -m tests.faults.soak --minutes $(MINUTES)
+
 dashboard: setup ## Write the Grafana dashboard from its program
 	$(BIN)/python deploy/grafana/dashboard.py > deploy/grafana/dashboards/liir.json
 
@@ -70,4 +78,4 @@ proto: setup ## Generate the gRPC code from proto/
 proto-check: proto
 	git diff --exit-code -- $(GEN)
 
-.PHONY: help setup train test browser fuzz test-monitoring test-compose dashboard lint proto proto-check
+.PHONY: help setup train test browser fuzz test-monitoring test-compose test-faults soak dashboard lint proto proto-check

@@ -1,0 +1,36 @@
+"""`liir learner`, except that every update but the first takes a hundred times as long as it would."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from typing import Any
+
+from liir_common import options
+from liir_common.types import Batch
+from services.learner import __main__, service
+
+SLOWER = 100
+_make_algorithm = service.make_algorithm
+
+
+def make_slow_algorithm(*arguments: Any) -> Any:
+    algorithm = _make_algorithm(*arguments)
+    update, warm = algorithm.update, False
+
+    def slow_update(batch: Batch) -> Mapping[str, float]:
+        nonlocal warm
+        begin = time.perf_counter()
+        figures = update(batch)
+        if warm:
+            time.sleep((SLOWER - 1) * (time.perf_counter() - begin))
+        warm = True
+        return figures
+
+    algorithm.update = slow_update  # type: ignore[method-assign]
+    return algorithm
+
+
+if __name__ == "__main__":
+    service.make_algorithm = make_slow_algorithm
+    options.run(__main__.learner)

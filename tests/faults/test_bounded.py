@@ -33,7 +33,9 @@ def program(name: str, *arguments: str, log: Path) -> subprocess.Popen[bytes]:
 
 def test_a_learner_a_hundred_times_slower_than_its_actors_does_not_grow(tmp_path: Path) -> None:
     run_dir, log = tmp_path / "run", tmp_path / "learner.log"
-    settings = service.arguments([f"training.lag={LAG}", "training.total_env_steps=1000000"])
+    settings = service.arguments(
+        [f"training.lag={LAG}", "training.total_env_steps=1000000", "learner.threads=1"]
+    )
     learner = program("slow_learner", "--run-dir", str(run_dir), *settings, log=log)
     actors = None
     try:

@@ -53,6 +53,14 @@ test-compose: setup ## Run docker-compose.yml through deaths, stops and resumes;
 test-ray-submit: setup ## Run ray up, submit and down on three isolated machines; needs root, sshd, rsync and ip
 	$(BIN)/pytest -m ray_submit $(ARGS)
 
+# As root in a namespace of its own where one is not root, since the tests mount a small disk.
+test-faults: setup ## Run the fault tests: a hundred faults in one training, and more
+	$(if $(filter 0,$(shell id -u)),,unshare --map-root-user --mount) $(BIN)/pytest -m faults $(ARGS)
+
+MINUTES ?= 5
+soak: setup ## Train for MINUTES and say whether memory, descriptors, threads or streams grow
+	$(BIN)/python -m tests.faults.soak --minutes $(MINUTES)
+
 dashboard: setup ## Write the Grafana dashboard from its program
 	$(BIN)/python deploy/grafana/dashboard.py > deploy/grafana/dashboards/liir.json
 
@@ -84,4 +92,5 @@ proto: setup ## Generate the gRPC code from proto/
 proto-check: proto
 	git diff --exit-code -- $(GEN)
 
-.PHONY: help setup train test browser fuzz test-monitoring test-compose test-ray-submit dashboard requirements lint proto proto-check
+.PHONY: help setup train test browser fuzz test-monitoring test-compose test-ray-submit test-faults soak dashboard \
+	requirements lint proto proto-check

@@ -1,14 +1,16 @@
 """Frozen checkpoints: a weights file in safetensors and a manifest that names its SHA-256.
 
-The manifest is written last, so a checkpoint exists exactly when its manifest does. A store may be a
-folder or any URL that fsspec knows.
+The manifest is written last, so a checkpoint exists exactly when its manifest does. One that was deleted has
+its manifest under another name, so that a resumed run that comes to it again neither freezes it anew nor
+differs from it unnoticed. A store may be a folder or any URL that fsspec knows.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+import threading
+from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -95,53 +97,81 @@ def section(tensors: Tensors, prefix: str) -> dict[str, NDArray[np.float32]]:
 
 
 class CheckpointStore:
-    """The checkpoints of one run. Published ones never change."""
+    """The checkpoints of one run, which never change. One thread may publish while another deletes."""
 
     def __init__(self, url: str) -> None:
         """Use the folder or fsspec URL, made if missing."""
         self._fs, self._root = fsspec.core.url_to_fs(url)
         self._fs.makedirs(self._root, exist_ok=True)
-        found = (path.rpartition("/")[2] for path in self._fs.ls(self._root, detail=False))
-        names = sorted(name for name in found if name.startswith("checkpoint-") and name.endswith(".json"))
-        self._manifests = [
-            self.read_manifest(int(name[len("checkpoint-") : -len(".json")])) for name in names
-        ]
+        self._lock = threading.Lock()
+        names = {path.rpartition("/")[2] for path in self._fs.ls(self._root, detail=False)}
+        kept = _episodes(names, "checkpoint-", ".json")
+        self._manifests = [self.read_manifest(episode) for episode in kept]
+        self._deleted = {
+            episode: self._read_manifest(self._deleted_path(episode)).sha256
+            for episode in _episodes(names, "deleted-", ".json")
+            if episode not in kept
+        }
+        for episode in set(_episodes(names, "checkpoint-", ".safetensors")) & self._deleted.keys():
+            self._fs.rm(self._weights_path(episode))  # who wanted to died before
 
     @property
     def manifests(self) -> list[Manifest]:
-        """All checkpoints, oldest first."""
+        """All checkpoints that are there, oldest first; the list does not change any more."""
         return self._manifests
 
+    @property
+    def frozen(self) -> int:
+        """How many checkpoints were ever frozen, the deleted ones included."""
+        return len(self._manifests) + len(self._deleted)
+
     def publish(self, manifest: Manifest, data: bytes) -> bool:
-        """Write a checkpoint; false if a resumed run came to the same one again.
+        """Write a checkpoint; false if a resumed run came to the same one again, deleted since or not.
 
         Raises:
             CorruptError: a checkpoint of that episode exists with other weights, so this run is not the
                 one that the store belongs to, or is not reproducible.
         """
-        for old in reversed(self._manifests):
-            if old.episode == manifest.episode:
-                if old.sha256 == manifest.sha256:
-                    return False
-                raise CorruptError(
-                    f"checkpoint {old.episode} exists with SHA-256 {old.sha256}, and this run made "
-                    f"{manifest.sha256}; use a new run directory, or resume with the build and machine "
-                    "type that began this one"
-                )
+        known = {old.episode: old.sha256 for old in self._manifests} | self._deleted
+        sha256 = known.get(manifest.episode, "")
+        if sha256 == manifest.sha256:
+            return False
+        if sha256:
+            raise CorruptError(
+                f"checkpoint {manifest.episode} exists with SHA-256 {sha256}, and this run made "
+                f"{manifest.sha256}; use a new run directory, or resume with the build and machine "
+                "type that began this one"
+            )
         self._write(self._weights_path(manifest.episode), data)
         self._write(self._manifest_path(manifest.episode), manifest.to_json().encode())
-        self._manifests.append(manifest)
+        with self._lock:
+            self._manifests = sorted([*self._manifests, manifest], key=lambda other: other.episode)
         return True
+
+    def delete(self, episode: int) -> None:
+        """Remove a checkpoint for good; whoever dies in the middle leaves it there or not, never a part.
+
+        Raises:
+            KeyError: there is no such checkpoint.
+        """
+        manifest = self.find(episode)
+        self._fs.mv(self._manifest_path(episode), self._deleted_path(episode))
+        with self._lock:
+            self._deleted[episode] = manifest.sha256
+            self._manifests = [other for other in self._manifests if other.episode != episode]
+        self._fs.rm(self._weights_path(episode))
 
     def find(self, episode: int) -> Manifest:
         """The manifest of the checkpoint frozen after `episode` episodes.
 
         Raises:
-            KeyError: there is none.
+            KeyError: there is none, or none any more.
         """
         for manifest in self._manifests:
             if manifest.episode == episode:
                 return manifest
+        if episode in self._deleted:
+            raise KeyError(f"checkpoint {episode} was deleted, as the run's section checkpoints wants it")
         raise KeyError(f"no checkpoint of episode {episode}")
 
     def read(self, manifest: Manifest) -> bytes:
@@ -160,7 +190,9 @@ class CheckpointStore:
         Raises:
             CorruptError: the file is not a manifest.
         """
-        path = self._manifest_path(episode)
+        return self._read_manifest(self._manifest_path(episode))
+
+    def _read_manifest(self, path: str) -> Manifest:
         try:
             return Manifest.from_json(self._fs.cat_file(path).decode())
         except (CorruptError, UnicodeDecodeError) as error:
@@ -172,9 +204,18 @@ class CheckpointStore:
     def _manifest_path(self, episode: int) -> str:
         return f"{self._root}/checkpoint-{episode:09d}.json"
 
+    def _deleted_path(self, episode: int) -> str:
+        return f"{self._root}/deleted-{episode:09d}.json"
+
     def _write(self, path: str, data: bytes) -> None:
         if "file" in self._fs.protocol:
             write_atomic(Path(path), data)
         else:
             # Object stores show an object when it is complete.
             self._fs.pipe_file(path, data)
+
+
+def _episodes(names: Collection[str], prefix: str, suffix: str) -> list[int]:
+    """The numbers in the names of that form, ascending."""
+    found = (name for name in names if name.startswith(prefix) and name.endswith(suffix))
+    return sorted(int(name[len(prefix) : -len(suffix)]) for name in found)

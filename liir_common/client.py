@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from liir_common.checkpoint import Manifest, unpack
 from liir_common.config import PLAINTEXT, Config, SecurityConfig, from_tree, merge, parse_settings
-from liir_common.errors import CorruptError, LiirError, RefusedError, UnreachableError
+from liir_common.errors import CorruptError, LiirError, MissingError, RefusedError, UnreachableError
 from liir_common.files import write_atomic
 from liir_common.rpc.channel import DEADLINE_S, backoffs, connect
 from liir_common.rpc.gen.liir.v1 import (
@@ -97,7 +97,8 @@ class CheckpointClient:
         """Manifest and weights file of one checkpoint; a download that breaks goes on where it broke.
 
         Raises:
-            LiirError: there is no such checkpoint, or the learner's copy is damaged.
+            MissingError: there is no such checkpoint, or it was deleted.
+            LiirError: the learner's copy is damaged.
             UnreachableError: the connection kept breaking.
             CorruptError: the bytes that came do not have the manifest's digest.
         """
@@ -203,7 +204,8 @@ class CheckpointClient:
                 return self._append_rest(episode, file)
             except grpc.RpcError as error:
                 if error.code() not in AWAY:
-                    raise LiirError(f"checkpoint {episode}: {error.details()}") from None
+                    kind = MissingError if error.code() == grpc.StatusCode.NOT_FOUND else LiirError
+                    raise kind(f"checkpoint {episode}: {error.details()}") from None
             if file.tell() > begin:
                 failures, waits = 0, backoffs()
             failures += 1

@@ -189,6 +189,17 @@ class TrainingConfig(Section):
     """Learner steps between saves of the learner's own state."""
 
 
+class CheckpointsConfig(Section):
+    """Which frozen checkpoints stay, once they are tested; one that is not yet tested always does."""
+
+    keep_newest: int = Field(0, ge=0)
+    """So many newest ones, and what the other rules keep; 0 keeps all."""
+    keep_every: int = Field(0, ge=0)
+    """Every so many-th of all that were frozen; 0 for none."""
+    keep_best: int = Field(1, ge=0)
+    """So many best ones, by greedy win rate, then sampled win rate, then the newer."""
+
+
 class ActorsConfig(Section):
     """The fleet."""
 
@@ -292,6 +303,7 @@ class Config(BaseSettings):
     env: EnvConfig = EnvConfig()
     algorithm: AlgorithmConfig = AlgorithmConfig()
     training: TrainingConfig = TrainingConfig()
+    checkpoints: CheckpointsConfig = CheckpointsConfig()
     actors: ActorsConfig = ActorsConfig()
     learner: LearnerConfig = LearnerConfig()
     evaluation: EvaluationConfig = EvaluationConfig()

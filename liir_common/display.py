@@ -25,6 +25,11 @@ _PHASES = {
 }
 
 
+def phase_name(status: training_pb2.GetStatusResponse) -> str:
+    """What the learner is doing, in words."""
+    return _PHASES.get(status.phase, "starting")
+
+
 class Display(Protocol):
     """Shows how far a run is."""
 
@@ -101,7 +106,7 @@ def _figures(
     """What a log line holds."""
     shown = ("return_mean", "length_mean", "policy_lag", "reward_ratio")
     figures: dict[str, object] = {
-        "phase": _PHASES.get(status.phase, "starting"),
+        "phase": phase_name(status),
         "env_steps": status.env_steps,
         "total_env_steps": status.total_env_steps,
         "env_steps_per_second": round(status.env_steps_per_second),
@@ -126,7 +131,7 @@ def rows(
     newest = status.metrics
     rate, lag = status.env_steps_per_second, newest["policy_lag"]
     return {
-        "phase": _PHASES.get(status.phase, "starting"),
+        "phase": phase_name(status),
         "env steps": f"{status.env_steps:,} of {status.total_env_steps:,}, {rate:,.0f}/s",
         "learner step": f"{status.learner_step:,} ({status.episodes:,} episodes, lag {lag:.0f})",
         "return": f"{newest['return_mean']:.2f} over {newest['length_mean']:.0f} steps an episode",

@@ -1,8 +1,10 @@
 """Errors that a person can act on, and what each means as an exit code."""
 
-import sys
+import errno
+import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from pathlib import Path
 
 
 class LiirError(Exception):
@@ -23,6 +25,10 @@ class UnreachableError(LiirError):
     exit_code = 3
 
 
+class MissingError(LiirError):
+    """What was asked for is not there, or no longer."""
+
+
 class CorruptError(LiirError, ValueError):
     """Stored or received bytes are not what their digest or format says."""
 
@@ -35,6 +41,16 @@ class RefusedError(LiirError):
     exit_code = 5
 
 
+class StorageError(LiirError):
+    """The run directory cannot be written to."""
+
+    exit_code = 6
+
+
+class DiskFullError(StorageError):
+    """There is no room for what should be written; later there may be."""
+
+
 class EpisodeLostError(LiirError):
     """The game broke down in an episode but is there for another: the ticket can be played again."""
 
@@ -45,5 +61,40 @@ def exit_on_error() -> Iterator[None]:
     try:
         yield
     except LiirError as error:
-        print(f"error: {error}", file=sys.stderr)
+        say(f"error: {error}")
         raise SystemExit(error.exit_code) from None
+
+
+def meaning(exit_code: int) -> str:
+    """What an exit code says, in one sentence."""
+    texts = {kind.exit_code: kind.__doc__ for kind in LiirError.__subclasses__() if "exit_code" in vars(kind)}
+    return (texts.get(exit_code) or "an error that is not foreseen").rstrip(".")
+
+
+def say(line: str) -> None:
+    """Write a line to stderr; where that is a file on a full disk the line is lost and nothing else.
+
+    Python's own stream would keep what it could not write, fail again at exit, and end with its own code.
+    """
+    with suppress(OSError):
+        os.write(2, f"{line}\n".encode())
+
+
+@contextmanager
+def storage_explained(path: Path) -> Iterator[None]:
+    """Turn an `OSError` of writing under `path` into a `StorageError` that says what to do.
+
+    Raises:
+        DiskFullError: the disk or the user's quota is full.
+        StorageError: anything else that the operating system refused.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            raise DiskFullError(
+                f"cannot write to {path}: {error.strerror}; free some space on its disk, then resume the run"
+            ) from error
+        raise StorageError(
+            f"cannot write to {error.filename or path}: {error.strerror}; mend that, then resume the run"
+        ) from error

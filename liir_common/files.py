@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import csv
+import errno
+import fcntl
 import io
 import os
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+from liir_common.errors import ConfigError
 
 
 def write_atomic(path: Path, data: bytes, mode: int = 0o644) -> None:
@@ -26,6 +31,30 @@ def write_atomic(path: Path, data: bytes, mode: int = 0o644) -> None:
         raise
 
 
+def remove_leftovers(directory: Path) -> None:
+    """Remove what processes that died in the middle of `write_atomic` left in a directory."""
+    for path in directory.glob(".*.????????"):
+        path.unlink()
+
+
+@contextmanager
+def held(directory: Path) -> Iterator[None]:
+    """Hold a directory, made if missing, while the block lasts or until this process dies.
+
+    Raises:
+        ConfigError: another process holds it.
+    """
+    directory.mkdir(parents=True, exist_ok=True)
+    with (directory / ".lock").open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ConfigError(
+                f"another process works in {directory}; wait for its end, or name another --run-dir"
+            ) from None
+        yield
+
+
 class Table:
     """A CSV file that grows by rows. A row may bring new columns; what a row lacks stays empty."""
 
@@ -35,31 +64,44 @@ class Table:
         rows = read_table(path)
         self._columns = list(rows[0]) if rows else []
         if rows:
-            self._rewrite(rows)  # without the row that a dying process may have left half-written
+            # Without the row that a dying process may have left half-written.
+            self._rewrite(rows, self._columns)
 
     def read(self) -> list[dict[str, str]]:
         """All rows, oldest first."""
         return read_table(self.path)
 
     def append(self, row: Mapping[str, Any]) -> None:
-        """Add one row, flushed to the operating system."""
+        """Add one row, flushed to the operating system; if that fails the file is as before."""
         new = [column for column in row if column not in self._columns]
         if new:
-            rows = self.read()
-            self._columns += new
-            self._rewrite(rows)
-        with self.path.open("a", newline="", encoding="utf-8") as file:
-            csv.DictWriter(file, self._columns, lineterminator="\n").writerow(row)
+            self._rewrite(self.read(), [*self._columns, *new])
+        text = io.StringIO()
+        csv.DictWriter(text, self._columns, lineterminator="\n").writerow(row)
+        _append_whole(self.path, text.getvalue().encode())
 
     def keep(self, column: str, at_most: int) -> None:
         """Drop the rows whose `column` is larger; a resumed run writes them again."""
         rows = self.read()
         kept = [row for row in rows if int(row[column]) <= at_most]
         if len(kept) < len(rows):
-            self._rewrite(kept)
+            self._rewrite(kept, self._columns)
 
-    def _rewrite(self, rows: list[dict[str, str]]) -> None:
-        write_atomic(self.path, csv_text(rows, self._columns).encode())
+    def _rewrite(self, rows: list[dict[str, str]], columns: list[str]) -> None:
+        write_atomic(self.path, csv_text(rows, columns).encode())
+        self._columns = columns
+
+
+def _append_whole(path: Path, data: bytes) -> None:
+    """Append all of `data` or, where the disk is full, nothing."""
+    with path.open("ab", buffering=0) as file:
+        end = file.seek(0, os.SEEK_END)
+        try:
+            if file.write(data) < len(data):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+        except OSError:
+            file.truncate(end)
+            raise
 
 
 def csv_text(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] = ()) -> str:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import ctypes
 import json
+import os
+import re
 import signal
 import subprocess
 import sys
@@ -22,8 +24,16 @@ from rich.console import Console
 from liir_common import options
 from liir_common.client import CheckpointClient, TrainingClient
 from liir_common.config import Config, SecurityConfig
-from liir_common.display import Display, make_display
-from liir_common.errors import ConfigError, LiirError, RefusedError, UnreachableError
+from liir_common.display import Display, make_display, phase_name
+from liir_common.errors import (
+    ConfigError,
+    LiirError,
+    RefusedError,
+    StorageError,
+    UnreachableError,
+    meaning,
+    storage_explained,
+)
 from liir_common.report import print_summary, write_report
 from liir_common.rpc.gen.liir.v1 import checkpoint_pb2
 from liir_common.rpc.tokens import Role
@@ -34,13 +44,21 @@ _POLL_S = 0.25
 _START_S = 120.0
 _STOP_S = 60.0
 END_S = 10.0
-_LAST_LINES = 5
 _RESTARTS, _RESTARTS_WITHIN_S = 3, 300.0
 _PR_SET_PDEATHSIG = 1
+_LAST_LINES, _LAST_BYTES = 5, 65_536
+_IN_VAIN = (ConfigError.exit_code, RefusedError.exit_code, StorageError.exit_code)
+"""Codes of processes that would only end in the same way again."""
+_EVENT = re.compile(r'"event": "([^"]*)"')
+_EXCEPTION = re.compile(r"^(?:error: |[\w.]*(?:Error|Exception)\b).*$", re.MULTILINE)
+"""The line of a log that has the type and the message, as `exit_on_error` or Python writes it."""
 
 
 class Service(ABC):
     """One process of the run, wherever it is."""
+
+    phase: str = ""
+    """What it said last that it was doing; only the learner is asked."""
 
     def __init__(self, name: str, arguments: Sequence[str], run_dir: Path, log_name: str = "") -> None:
         """Prepare `python -m services.NAME ARGUMENTS`; its log is a file in the run directory."""
@@ -69,7 +87,19 @@ class Service(ABC):
 
     @abstractmethod
     def last_words(self) -> str:
-        """The end of its log."""
+        """The end of its log since it was started last."""
+
+    def obituary(self) -> str:
+        """How it ended, its last phase and exception, and the end of its log."""
+        code, words = self.exit_code or 0, self.last_words()
+        how = signal.Signals(-code).name if code < 0 else meaning(code)
+        phase = self.phase or (_EVENT.findall(words) or ["starting"])[-1]
+        exceptions = _EXCEPTION.findall(words) or ["none in its log"]
+        lines = "\n".join(words.splitlines()[-_LAST_LINES:])
+        return (
+            f"the {self.name} ended with code {code} ({how}) in the phase {phase!r}; "
+            f"last exception: {exceptions[-1]}; {self.log_path} ends with\n{lines}"
+        )
 
     def may_restart(self) -> bool:
         """Whether another start makes sense: not after several deaths in a short time."""
@@ -86,11 +116,15 @@ class LocalService(Service):
     """A child of this process."""
 
     _process: subprocess.Popen[bytes] | None = None
+    _log_begin: int = 0
+    """Where in the log the present incarnation begins."""
 
     def start(self) -> None:
         """Start it in a process group of its own, so that Ctrl-C reaches only the launcher."""
+        self.phase = ""
         self.log_path.parent.mkdir(parents=True, exist_ok=True)
         with self.log_path.open("ab") as file:
+            self._log_begin = file.tell()
             self._process = subprocess.Popen(
                 [sys.executable, "-m", f"services.{self.name}", *self.arguments],
                 stdout=file,
@@ -126,8 +160,11 @@ class LocalService(Service):
             self._process.wait()
 
     def last_words(self) -> str:
-        """The end of its log."""
-        return "\n".join(self.log_path.read_text(errors="replace").splitlines()[-_LAST_LINES:])
+        """The end of its log since it was started last."""
+        with self.log_path.open("rb") as file:
+            size = file.seek(0, os.SEEK_END)
+            file.seek(max(self._log_begin, size - _LAST_BYTES))
+            return file.read().decode(errors="replace")
 
 
 def as_settings(security: SecurityConfig) -> list[str]:
@@ -165,7 +202,7 @@ class Launcher:
         """Train until the run is complete or a signal asks to stop.
 
         Raises:
-            LiirError: a process cannot be kept running; the message has its last words.
+            LiirError: a process cannot be kept running; the message says how it ended.
         """
         for signum in (signal.SIGINT, signal.SIGTERM):
             signal.signal(signum, self._on_signal)
@@ -204,7 +241,9 @@ class Launcher:
             if self._learner.exit_code is not None:
                 self._raise_death(self._learner)
             time.sleep(_POLL_S / 5)
-        raise LiirError(f"the learner did not start within {_START_S:g} s:\n{self._learner.last_words()}")
+        raise LiirError(
+            f"the learner did not start within {_START_S:g} s; {self._learner.log_path} says what it does"
+        )
 
     def _watch(self, address: str) -> None:
         console = Console(stderr=True)
@@ -237,7 +276,9 @@ class Launcher:
     ) -> None:
         try:
             shown.extend(checkpoints.evaluations(shown[-1].episode if shown else 0))
-            display.show(training.status(), shown)
+            status = training.status()
+            self._learner.phase = phase_name(status)
+            display.show(status, shown)
         except grpc.RpcError as error:
             log.info("the learner does not answer", reason=error.details())
 
@@ -247,22 +288,28 @@ class Launcher:
             code = service.exit_code
             if code in (None, 0):
                 continue
-            if code in (ConfigError.exit_code, RefusedError.exit_code) or not service.may_restart():
+            if code in _IN_VAIN or not service.may_restart():
                 self._raise_death(service)
-            log.error("a process died; it is started again", service=service.name, exit_code=code)
+            log.error("a process died; it is started again", reason=service.obituary())
             service.start()
 
     def _stop(self, training: TrainingClient) -> None:
-        training.stop(f"signal {signal.Signals(self._stop_signal).name}")
+        try:
+            training.stop(f"signal {signal.Signals(self._stop_signal).name}")
+        except grpc.RpcError as error:
+            log.info("the learner does not answer; told by signal to end", reason=error.details())
+            self._learner.end()
         deadline = time.monotonic() + _STOP_S
         while self._learner.exit_code is None:
             if time.monotonic() > deadline:
                 log.warning("the learner did not end in time", timeout_s=_STOP_S)
                 return
             time.sleep(_POLL_S)
+        if self._learner.exit_code:
+            self._raise_death(self._learner)
 
     def _raise_death(self, service: Service) -> None:
-        error = LiirError(f"the {service.name} ended with code {service.exit_code}:\n{service.last_words()}")
+        error = LiirError(service.obituary())
         error.exit_code = service.exit_code or 1
         raise error
 
@@ -298,7 +345,9 @@ def train(
     run_dir = run_dir or Path("runs") / _run_name(config)
     launcher = make_launcher(Request(run_dir, config, file, settings, resume))
     launcher.run(config.evaluation.enabled)
-    print_summary(run_dir, write_report(run_dir))
+    with storage_explained(run_dir):
+        summary = write_report(run_dir)
+    print_summary(run_dir, summary)
     if launcher.stop_signal:
         print(f"stopped early; go on with: {command} --resume --run-dir {run_dir}", file=sys.stderr)
         raise SystemExit(128 + launcher.stop_signal)

@@ -6,6 +6,17 @@ import sys
 import structlog
 from structlog.tracebacks import ExceptionDictTransformer
 
+from liir_common.errors import say
+
+
+class _StderrLogger:
+    """Hands every line, whatever its level, to `say`: a log that cannot be written ends no process."""
+
+    def __init__(self, *_: object) -> None:
+        """Nothing to open."""
+
+    msg = debug = info = warning = error = critical = exception = staticmethod(say)
+
 
 def configure(process: str) -> None:
     """Set up logging of this process to stderr; every line names the process."""
@@ -23,6 +34,6 @@ def configure(process: str) -> None:
             renderer,
         ],
         wrapper_class=structlog.make_filtering_bound_logger(logging.INFO),
-        logger_factory=structlog.PrintLoggerFactory(sys.stderr),
+        logger_factory=_StderrLogger,
     )
     structlog.contextvars.bind_contextvars(process=process)

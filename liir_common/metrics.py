@@ -68,11 +68,13 @@ RECEIVED_BYTES = LEARNER.counter("liir_trajectory_bytes_total", "Bytes of trajec
 ACTOR_PLAY_SECONDS = LEARNER.counter("liir_actor_play_seconds_total", "Seconds all actors spent playing")
 ACTOR_WAIT_SECONDS = LEARNER.counter("liir_actor_wait_seconds_total", "Seconds all actors waited for tickets")
 ACTOR_MEMORY = LEARNER.gauge("liir_actor_peak_memory_bytes", "Peak resident memory, connected actors' sum")
+DISK_FULL = LEARNER.gauge("liir_disk_full", "1 while the run waits for room on its disk")
 RPC_ERRORS = LEARNER.counter("liir_rpc_errors_total", "Calls refused, by status code", ["method", "code"])
 
 # Learner: checkpoints and their tests.
 CHECKPOINTS = LEARNER.gauge("liir_checkpoints", "Checkpoints frozen")
 CHECKPOINT_TIME = LEARNER.gauge("liir_checkpoint_timestamp_seconds", "Unix time of the newest checkpoint")
+CHECKPOINTS_DELETED = LEARNER.gauge("liir_checkpoints_deleted", "Checkpoints deleted since, of those frozen")
 EVALUATIONS = LEARNER.gauge("liir_evaluations", "Checkpoints tested")
 WIN_RATE = LEARNER.gauge("liir_win_rate", "Wins / episodes of the newest test, 0 to 1", ["map", "actions"])
 EVALUATION_RETURN = LEARNER.gauge(

@@ -219,10 +219,11 @@ def build() -> dashboard.Dashboard:
             ).min(0),
             series(
                 "Frozen and tested",
-                "The gap is the backlog.",
+                "The gap is the backlog; the section checkpoints of the configuration has old ones deleted.",
                 "short",
                 ("liir_checkpoints", "frozen"),
                 ("liir_evaluations", "tested"),
+                ("liir_checkpoints_deleted", "deleted"),
             ).min(0),
             series(
                 "Evaluator's position",
@@ -233,6 +234,9 @@ def build() -> dashboard.Dashboard:
         ],
         "Health": [
             series("Up", "1 while a process answers.", "short", ("up", "{{job}}")).min(0).max(1),
+            series("Disk full", "1 while the run waits for room.", "short", ("liir_disk_full", "full"))
+            .min(0)
+            .max(1),
             series(
                 "Actors",
                 "Streams at the learner, Ray actors running, and those that should.",

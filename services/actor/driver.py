@@ -150,6 +150,8 @@ class Fleet:
                 self._members.remove(member)
 
     def _died(self, member: _Member, error: Exception) -> None:
+        # Ray also calls an actor dead that it cannot reach for a moment; left alone, it would play on.
+        ray.kill(member.actor)
         now = time.monotonic()
         if now - member.started > _QUICK_DEATH_S:
             self._waits[member.name] = backoffs()

@@ -11,7 +11,7 @@ import structlog
 from liir_common import checkpoint, metrics, seeds
 from liir_common.client import AWAY, CheckpointClient
 from liir_common.config import Config
-from liir_common.errors import RefusedError, UnreachableError
+from liir_common.errors import MissingError, RefusedError, UnreachableError
 from liir_common.rollout.player import Player
 from liir_common.rpc.channel import backoffs
 from liir_common.rpc.gen.liir.v1 import checkpoint_pb2
@@ -79,9 +79,15 @@ class Evaluator:
     def _catch_up(self, client: CheckpointClient) -> None:
         tested = {evaluation.episode for evaluation in client.evaluations()}
         for frozen in client.watch():
-            if frozen.episode not in tested:
+            if frozen.episode in tested:
+                continue
+            try:
                 with metrics.EVALUATION_SECONDS.time():
                     client.report(self._test(client, frozen))
+            except MissingError as error:
+                # Only tested ones are ever deleted: another evaluator was quicker.
+                log.info("not tested", episode=frozen.episode, reason=str(error))
+            else:
                 metrics.EVALUATED_EPISODE.set(frozen.episode)
 
     def _test(self, client: CheckpointClient, frozen: checkpoint_pb2.Checkpoint) -> checkpoint_pb2.Evaluation:

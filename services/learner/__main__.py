@@ -1,10 +1,12 @@
 """`liir learner`: the learner process."""
 
 import asyncio
+from contextlib import ExitStack
 from pathlib import Path
 
 from liir_common import logs, options
-from liir_common.errors import exit_on_error
+from liir_common.errors import exit_on_error, storage_explained
+from liir_common.files import held
 from liir_common.rollout.play import env_spec
 from services.learner.run_directory import RunDirectory
 from services.learner.service import serve
@@ -24,7 +26,11 @@ def learner(
     with exit_on_error():
         resolved = options.load_run_config(config, settings, path, resume)
         spec = env_spec(resolved.env)
-        asyncio.run(serve(resolved, RunDirectory(path, resolved, spec), spec))
+        with ExitStack() as stack:
+            with storage_explained(path):
+                stack.enter_context(held(path))
+                run = RunDirectory(path, resolved, spec)
+            asyncio.run(serve(resolved, run, spec))
 
 
 if __name__ == "__main__":

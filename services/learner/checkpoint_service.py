@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import asyncio
+import bisect
 import math
 from collections.abc import AsyncIterator, Mapping, Sequence
 from typing import Any
 
 import grpc
+import structlog
 
 from liir_common import metrics
 from liir_common.checkpoint import Manifest
-from liir_common.errors import CorruptError
+from liir_common.errors import CorruptError, StorageError, storage_explained
 from liir_common.rpc.gen.liir.v1 import checkpoint_pb2, checkpoint_pb2_grpc
 from liir_common.rpc.refused import Refused
+from services.learner.retention import superseded
 from services.learner.run_directory import RunDirectory
+
+log = structlog.get_logger()
 
 _CHUNK_BYTES = 64 * 1024
 _MAX_LIST = 1000
@@ -32,14 +37,16 @@ class CheckpointService(checkpoint_pb2_grpc.CheckpointServiceServicer):
             evaluation.episode: evaluation for evaluation in map(_from_row, run.evaluations.read())
         }
         self._show_evaluations()
+        self._delete_superseded()  # a resumed run may have another rule
 
     @property
     def all_evaluated(self) -> bool:
         """Whether every checkpoint so far has its test."""
-        return len(self.evaluations) == len(self._run.checkpoints.manifests)
+        return all(manifest.episode in self.evaluations for manifest in self._run.checkpoints.manifests)
 
     async def changed(self) -> None:
-        """Wake the watchers: there is a new checkpoint or a new evaluation."""
+        """Wake the watchers: there is a new checkpoint or a new evaluation; older ones may go."""
+        self._delete_superseded()
         async with self._changed:
             self._changed.notify_all()
 
@@ -84,17 +91,17 @@ class CheckpointService(checkpoint_pb2_grpc.CheckpointServiceServicer):
         self, request: checkpoint_pb2.WatchCheckpointsRequest, context: grpc.aio.ServicerContext
     ) -> AsyncIterator[checkpoint_pb2.WatchCheckpointsResponse]:
         """Every checkpoint after a position, in order, until the run is complete."""
-        manifests = self._run.checkpoints.manifests
-        seen = sum(manifest.episode <= request.after_episode for manifest in manifests)
+        seen = request.after_episode
         while True:
-            while seen < len(manifests):
-                yield checkpoint_pb2.WatchCheckpointsResponse(checkpoint=_to_message(manifests[seen]))
-                seen += 1
+            # One at a time: while one is sent, others may come or be deleted.
+            while manifest := self._first_after(seen):
+                yield checkpoint_pb2.WatchCheckpointsResponse(checkpoint=_to_message(manifest))
+                seen = manifest.episode
             if self._complete:
                 return
             async with self._changed:
-                # The trainer appends before it notifies, so this cannot sleep through a checkpoint.
-                if seen == len(manifests) and not self._complete:
+                # The trainer publishes before it notifies, so this cannot sleep through a checkpoint.
+                if not self._first_after(seen) and not self._complete:
                     await self._changed.wait()
 
     async def ReportEvaluation(
@@ -102,11 +109,18 @@ class CheckpointService(checkpoint_pb2_grpc.CheckpointServiceServicer):
     ) -> checkpoint_pb2.ReportEvaluationResponse:
         """Store the test of a checkpoint, once."""
         evaluation = request.evaluation
+        if known := self.evaluations.get(evaluation.episode):
+            # Its checkpoint may be deleted by now.
+            _check_digest(evaluation, known.sha256)
+            return checkpoint_pb2.ReportEvaluationResponse(duplicate=True)
         manifest = self._find(evaluation.episode)
         _check(evaluation, manifest, self._run.spec.info_keys)
-        if evaluation.episode in self.evaluations:
-            return checkpoint_pb2.ReportEvaluationResponse(duplicate=True)
-        self._run.evaluations.append(_to_row(evaluation, manifest, self._run.created))
+        try:
+            with storage_explained(self._run.path):
+                self._run.evaluations.append(_to_row(evaluation, manifest, self._run.created))
+        except StorageError as error:
+            # The evaluator keeps trying, and until then the learner does not call the checkpoint tested.
+            raise Refused(grpc.StatusCode.UNAVAILABLE, str(error)) from None
         self.evaluations[evaluation.episode] = evaluation
         self._show_evaluations()
         await self.changed()
@@ -124,9 +138,23 @@ class CheckpointService(checkpoint_pb2_grpc.CheckpointServiceServicer):
     def _find(self, episode: int) -> Manifest:
         try:
             return self._run.checkpoints.find(episode)
-        except KeyError:
-            message = f"no checkpoint of episode {episode}; ListCheckpoints says which there are"
+        except KeyError as error:
+            message = f"{error.args[0]}; ListCheckpoints says which there are"
             raise Refused(grpc.StatusCode.NOT_FOUND, message) from None
+
+    def _first_after(self, episode: int) -> Manifest | None:
+        manifests = self._run.checkpoints.manifests
+        position = bisect.bisect_right(manifests, episode, key=lambda manifest: manifest.episode)
+        return manifests[position] if position < len(manifests) else None
+
+    def _delete_superseded(self) -> None:
+        store = self._run.checkpoints
+        for episode in superseded(store.manifests, self.evaluations, self._run.config):
+            try:
+                store.delete(episode)
+            except OSError as error:
+                log.warning("a checkpoint cannot be deleted", episode=episode, reason=str(error))
+        metrics.CHECKPOINTS_DELETED.set(store.frozen - len(store.manifests))
 
     def _show_evaluations(self) -> None:
         metrics.EVALUATIONS.set(len(self.evaluations))
@@ -155,9 +183,13 @@ def _to_message(manifest: Manifest) -> checkpoint_pb2.Checkpoint:
     )
 
 
+def _check_digest(evaluation: checkpoint_pb2.Evaluation, wanted: str) -> None:
+    if evaluation.sha256 != wanted:
+        raise ValueError(f"evaluation: wanted one of SHA-256 {wanted}, got {evaluation.sha256!r}")
+
+
 def _check(evaluation: checkpoint_pb2.Evaluation, manifest: Manifest, info_keys: Sequence[str]) -> None:
-    if evaluation.sha256 != manifest.sha256:
-        raise ValueError(f"evaluation: wanted one of SHA-256 {manifest.sha256}, got {evaluation.sha256!r}")
+    _check_digest(evaluation, manifest.sha256)
     for name in ("greedy", "sampled"):
         stats = getattr(evaluation, name)
         if not 0 <= stats.wins <= stats.episodes or stats.episodes == 0:

@@ -30,7 +30,7 @@ from liir_common.build import build, git_commit
 from liir_common.checkpoint import CheckpointStore
 from liir_common.config import Config
 from liir_common.errors import ConfigError, CorruptError
-from liir_common.files import Table, write_atomic
+from liir_common.files import Table, remove_leftovers, write_atomic
 from liir_common.types import EnvSpec
 from services.learner.replay_store import ReplayStore
 
@@ -60,7 +60,9 @@ class RunDirectory:
         self.path = path
         self.config = config
         self.spec = spec
-        (path / "state").mkdir(parents=True, exist_ok=True)
+        for folder in (path, path / "state", path / "checkpoints"):
+            folder.mkdir(parents=True, exist_ok=True)
+            remove_leftovers(folder)
         if not (path / "run.json").exists():
             self._write_json("run.json", {"run_id": uuid.uuid4().hex, "created": time.time()})
         record = self._read_record()

@@ -11,6 +11,7 @@ import torch
 
 from liir_common import metrics, seeds
 from liir_common.config import Config
+from liir_common.errors import storage_explained
 from liir_common.rpc.gen.liir.v1 import (
     checkpoint_pb2_grpc,
     rollout_pb2_grpc,
@@ -50,7 +51,8 @@ async def serve(config: Config, run: RunDirectory, spec: EnvSpec) -> None:
         spec, config.algorithm, seeds.derive(config.seed, seeds.LEARNER), device(config.learner.device)
     )
     log.info("parameters", **algorithm.parameter_counts())
-    run.write_parameters(algorithm.parameter_counts())
+    with storage_explained(run.path):
+        run.write_parameters(algorithm.parameter_counts())
 
     def publish(opening: Opening, weights: Weights) -> None:
         loop.call_soon_threadsafe(rollouts.publish, opening, weights)
@@ -58,7 +60,8 @@ async def serve(config: Config, run: RunDirectory, spec: EnvSpec) -> None:
     def frozen() -> None:
         asyncio.run_coroutine_threadsafe(checkpoints.changed(), loop)
 
-    trainer = Trainer(run, algorithm, publish, frozen)
+    with storage_explained(run.path):
+        trainer = Trainer(run, algorithm, publish, frozen)
     metrics.BATCHES_WAITING.set_function(trainer.batches.qsize)
     rollouts = RolloutService(config, spec, trainer.next_batch, trainer.batches)
     checkpoints = CheckpointService(run)
@@ -77,7 +80,10 @@ async def serve(config: Config, run: RunDirectory, spec: EnvSpec) -> None:
         loop.add_signal_handler(signum, stop, signum.name)
 
     await server.start()
-    run.write_endpoints({"address": server.local_address, "metrics": f"{config.metrics.host}:{metrics_port}"})
+    with storage_explained(run.path):
+        run.write_endpoints(
+            {"address": server.local_address, "metrics": f"{config.metrics.host}:{metrics_port}"}
+        )
     log.info("serving", address=f"{config.learner.host}:{server.port}", run=str(run.path))
     expiry = asyncio.create_task(rollouts.expire_tickets())
     try:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import queue
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
+from functools import partial
+from typing import Any
 
 import numpy as np
 import structlog
@@ -18,6 +21,7 @@ from torch import Tensor
 from liir_common import metrics
 from liir_common.build import git_commit
 from liir_common.checkpoint import Manifest, pack
+from liir_common.errors import DiskFullError, storage_explained
 from liir_common.rpc.gen.liir.v1 import training_pb2
 from liir_common.types import Batch, Trajectory, Weights
 from services.learner.algorithms import Algorithm
@@ -26,6 +30,8 @@ from services.learner.intake import Opening
 from services.learner.run_directory import Counters, RunDirectory
 
 log = structlog.get_logger()
+
+_ROOM_POLL_S = 2.0
 
 Batches = queue.SimpleQueue[list[Trajectory] | None]
 """Complete batches in order; None wakes a trainer that was told to stop."""
@@ -40,7 +46,7 @@ class Progress:
     newest: Mapping[str, float] = field(default_factory=dict)
     """Metrics of the newest learner step."""
     recent: deque[tuple[float, int]] = field(default_factory=lambda: deque(maxlen=50))
-    """(time, environment steps) of the last learner steps."""
+    """(monotonic time, environment steps) of the last learner steps."""
 
     @property
     def env_steps_per_second(self) -> float:
@@ -72,7 +78,14 @@ class Trainer:
         self.progress = Progress()
         self._publish = publish
         self._frozen = frozen
-        self._stopping = False
+        self._stopping = threading.Event()
+        self._origin: dict[str, Any] = {
+            "run_id": run.run_id,
+            "git_commit": git_commit(),
+            "env_spec": asdict(run.spec),
+            "config": run.config.shared_tree(),
+        }
+        """What all manifests say alike, in memory once."""
         self._openings: deque[tuple[Opening, Weights]] = deque()
         self._restore()
 
@@ -88,15 +101,20 @@ class Trainer:
 
     def stop(self) -> None:
         """End after the learner step under way."""
-        self._stopping = True
+        self._stopping.set()
         self.batches.put(None)
 
     def run(self) -> None:
-        """Train; the state is saved when this returns."""
+        """Train; the state is saved when this returns.
+
+        Raises:
+            StorageError: the run directory cannot be written to; while it is only full, this waits for room
+                until told to stop.
+        """
         set_up_process(self.config.learner.threads)
         for opening, weights in () if self.complete else self._openings:
             self._publish(opening, weights)
-        while not (self._stopping or self.complete) and self._step():
+        while not (self._stopping.is_set() or self.complete) and self._step():
             pass
         self._save()
 
@@ -140,7 +158,6 @@ class Trainer:
 
     def _record(self, opening: Opening, trajectories: list[Trajectory], figures: Mapping[str, float]) -> None:
         counters, progress = self.progress.counters, self.progress
-        now = time.time()
         episode_figures = {
             "return_mean": float(np.mean([t.reward.sum() for t in trajectories])),
             "length_mean": float(np.mean([t.length for t in trajectories])),
@@ -154,9 +171,11 @@ class Trainer:
             "epsilon": opening.epsilon,
         }
         progress.newest = {**episode_figures, **policy, **figures}
-        progress.recent.append((now, counters.env_steps))
-        row = {**asdict(counters), "time": now, **progress.newest}
-        self.run_directory.metrics.append(row)
+        progress.recent.append((time.monotonic(), counters.env_steps))
+        # Together with their number and order, which the batch checks, these say which episodes it had.
+        episodes = {"first_episode": trajectories[0].episode_id, "last_episode": trajectories[-1].episode_id}
+        row = {**asdict(counters), **episodes, "time": time.time(), **progress.newest}
+        self._store(lambda: self.run_directory.metrics.append(row))
         steps = sum(t.length for t in trajectories)
         metrics.ENV_STEPS.labels(self.config.env.label).inc(steps)
         metrics.EPISODES.labels(self.config.env.label).inc(len(trajectories))
@@ -179,27 +198,24 @@ class Trainer:
                 episode=episode,
                 policy_version=counters.learner_step,
                 env_steps=counters.env_steps,
-                run_id=self.run_directory.run_id,
-                git_commit=git_commit(),
-                env_spec=asdict(self.run_directory.spec),
-                config=self.config.shared_tree(),
                 created=time.time(),
                 sha256=hashlib.sha256(data).hexdigest(),
                 size_bytes=len(data),
+                **self._origin,
             )
-            self.run_directory.checkpoints.publish(manifest, data)
+            self._store(partial(self.run_directory.checkpoints.publish, manifest, data))
             self._show_progress()
             self._frozen()
 
     def _show_progress(self) -> None:
         """Set the gauges that go on where they were when a run is resumed."""
-        counters, manifests = self.progress.counters, self.run_directory.checkpoints.manifests
+        counters, store = self.progress.counters, self.run_directory.checkpoints
         metrics.LEARNER_STEP.set(counters.learner_step)
         metrics.RUN_ENV_STEPS.set(counters.env_steps)
         metrics.RUN_ENV_STEPS_WANTED.set(self.config.training.total_env_steps)
-        metrics.CHECKPOINTS.set(len(manifests))
-        if manifests:
-            metrics.CHECKPOINT_TIME.set(manifests[-1].created)
+        metrics.CHECKPOINTS.set(store.frozen)
+        if store.manifests:
+            metrics.CHECKPOINT_TIME.set(store.manifests[-1].created)
 
     def _save(self) -> None:
         """Keep everything the next learner step depends on."""
@@ -209,7 +225,7 @@ class Trainer:
             for name, array in weights.items():
                 tensors[f"opening.{opening.batch}.{name}"] = torch.from_numpy(array)
         notes = {"openings": [asdict(opening) for opening, _ in self._openings]}
-        self.run_directory.save_state(self.progress.counters, tensors, notes)
+        self._store(lambda: self.run_directory.save_state(self.progress.counters, tensors, notes))
 
     def _save_replay(self) -> None:
         """Append the new episodes, before the state that counts them; drop those that no kept state needs."""
@@ -217,9 +233,31 @@ class Trainer:
         if replay is None:
             return
         first = max(store.stop, replay.first)
-        store.append(first, replay.frames(first))
+        self._store(lambda: store.append(first, replay.frames(first)))
         oldest = self.run_directory.oldest_state_step * self.config.training.batch_episodes
         store.prune(oldest - self.config.algorithm.replay.episodes)
+
+    def _store(self, write: Callable[[], object]) -> None:
+        """Write to the run directory, once there is room.
+
+        Raises:
+            StorageError: it cannot be written to, or is full and the trainer was told to stop.
+        """
+        while True:
+            try:
+                with storage_explained(self.run_directory.path):
+                    write()
+            except DiskFullError as error:
+                if self._stopping.is_set():
+                    raise
+                metrics.DISK_FULL.set(1)
+                log.error(
+                    "the run waits for room on its disk", reason=str(error), **asdict(self.progress.counters)
+                )
+                self._stopping.wait(_ROOM_POLL_S)
+            else:
+                metrics.DISK_FULL.set(0)
+                return
 
     def _restore_replay(self, total: int) -> None:
         if self.algorithm.replay is not None:

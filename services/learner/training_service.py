@@ -57,7 +57,7 @@ class TrainingService(training_pb2_grpc.TrainingServiceServicer):
             episodes=progress.counters.episodes,
             actors=self._rollouts.actors,
             tickets_outstanding=self._rollouts.outstanding,
-            checkpoints=len(self._run.checkpoints.manifests),
+            checkpoints=self._run.checkpoints.frozen,
             evaluations=len(self._checkpoints.evaluations),
             env_steps_per_second=progress.env_steps_per_second,
             metrics=progress.newest,

@@ -52,14 +52,14 @@ def start(command: str, *rest: str) -> subprocess.Popen[str]:
     )
 
 
-def finish(process: subprocess.Popen[str], code: int = 0) -> str:
+def finish(process: subprocess.Popen[str], code: int = 0, timeout_s: float = TIMEOUT_S) -> str:
     """Wait for the end with the wanted exit code; returns the output."""
     try:
-        output, _ = process.communicate(timeout=TIMEOUT_S)
+        output, _ = process.communicate(timeout=timeout_s)
     except subprocess.TimeoutExpired:
         process.send_signal(signal.SIGTERM)
         output, _ = process.communicate(timeout=30)
-        raise AssertionError(f"did not end within {TIMEOUT_S:g} s:\n{output}") from None
+        raise AssertionError(f"did not end within {timeout_s:g} s:\n{output}") from None
     assert process.returncode == code, f"ended with {process.returncode}, wanted {code}:\n{output}"
     return output
 

@@ -19,6 +19,7 @@ import psutil
 import pytest
 import yaml
 
+from liir_common.replay.load import find_checkpoint
 from tests.e2e import service
 
 
@@ -40,6 +41,8 @@ def assert_same(run_dir: Path, undisturbed: Path) -> None:
     rows = list(csv.DictReader((run_dir / "metrics.csv").open()))
     assert [int(row["learner_step"]) for row in rows] == list(range(1, len(rows) + 1))
     assert [int(row["episodes"]) for row in rows] == [8 * step for step in range(1, len(rows) + 1)]
+    batches = [(int(row["first_episode"]), int(row["last_episode"])) for row in rows]
+    assert batches == [(8 * step, 8 * step + 7) for step in range(len(rows))]
 
 
 def evaluations(run_dir: Path) -> list[dict[str, str]]:
@@ -104,6 +107,23 @@ def test_a_death_changes_nothing(
         kill(process, run_dir)
         service.finish(process)
     assert_same(run_dir, undisturbed)
+
+
+def test_old_checkpoints_go_and_nothing_else_changes(undisturbed: Path, tmp_path: Path) -> None:
+    """The killed learner comes to some of the deleted ones again."""
+    run_dir = tmp_path / "run"
+    rules = ("checkpoints.keep_newest=2", "checkpoints.keep_every=4", "checkpoints.keep_best=1")
+    with service.training(run_dir, *rules, "training.save_interval=10") as process:
+        service.wait_for(lambda: service.learner_step(run_dir) >= 18, "the eighteenth learner step")
+        kill_learner(process, run_dir)
+        service.finish(process)
+    assert evaluations(run_dir) == evaluations(undisturbed)
+    everything = service.digests(undisturbed)
+    tests = {int(row["episode"]): row for row in evaluations(run_dir)}
+    best = max(tests, key=lambda e: (tests[e]["greedy_win_rate"], tests[e]["sampled_win_rate"], e))
+    kept = {*list(everything)[-2:], *(episode for episode in everything if episode % 80 == 0), best}
+    assert service.digests(run_dir) == {episode: everything[episode] for episode in sorted(kept)}
+    assert find_checkpoint(None, run_dir, best=True).exists()
 
 
 def test_an_actor_killed_in_the_middle_of_an_episode_changes_nothing(

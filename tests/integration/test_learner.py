@@ -23,7 +23,7 @@ from liir_common import checkpoint, seeds
 from liir_common.build import build
 from liir_common.cli import app
 from liir_common.client import CheckpointClient, TrainingClient
-from liir_common.errors import ConfigError, LiirError, UnreachableError
+from liir_common.errors import ConfigError, LiirError, MissingError, UnreachableError
 from liir_common.policy import Policy
 from liir_common.replay.load import find_checkpoint
 from liir_common.rollout.play import make_player
@@ -87,13 +87,14 @@ class Actor:
 
 
 @pytest.fixture
-def learner(tmp_path: Path) -> Iterator[tuple[str, Path]]:
-    """Address and run directory of a learner whose batches have four episodes."""
+def learner(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[tuple[str, Path]]:
+    """Address and run directory of a learner whose batches have four episodes; more settings as parameter."""
     run_dir = tmp_path / "run"
     settings = (
         "training.batch_episodes=4",
         "training.checkpoint_interval=6",
         "training.total_env_steps=2000",
+        *getattr(request, "param", ()),
     )
     process = service.start("learner", "--run-dir", str(run_dir), *service.arguments(settings))
     try:
@@ -322,6 +323,43 @@ def test_grpcurl_needs_no_proto_files(learner: tuple[str, Path]) -> None:
     assert b"".join(base64.b64decode(message["chunk"]) for message in chunks) == stored[10:]
 
 
+def evaluation_of(frozen: checkpoint_pb2.Checkpoint) -> checkpoint_pb2.Evaluation:
+    stats = checkpoint_pb2.EpisodeStats(episodes=4, wins=0)
+    return checkpoint_pb2.Evaluation(
+        episode=frozen.episode, sha256=frozen.sha256, env_steps=frozen.env_steps, greedy=stats, sampled=stats
+    )
+
+
+@pytest.mark.parametrize("learner", [("checkpoints.keep_newest=1", "checkpoints.keep_best=0")], indirect=True)
+def test_deleted_checkpoints_leave_gaps_that_say_so(learner: tuple[str, Path]) -> None:
+    address, run_dir = learner
+    play_batches(address, 5)
+    with CheckpointClient(address) as client, TrainingClient(address) as training:
+        watched = client.watch()
+        frozen = [next(watched) for _ in range(3)]
+        assert [checkpoint.episode for checkpoint in client.list()] == [6, 12, 18]
+        for tested in frozen[:2]:
+            assert client.report(evaluation_of(tested))
+        assert list(client.list()) == [next(client.watch())] == frozen[2:]
+        with pytest.raises(MissingError, match="checkpoint 6 was deleted"):
+            client.get(6)
+        # The answer to the first report may have been lost, so that it comes again.
+        assert not client.report(evaluation_of(frozen[0]))
+        assert client.report(evaluation_of(frozen[2]))
+        assert list(client.list()) == frozen[2:]
+        play_batches(address, 1)
+        assert next(watched).episode == 24
+        assert [checkpoint.episode for checkpoint in client.list()] == [24]
+        status = training.status()
+        assert (status.checkpoints, status.evaluations) == (4, 3)
+    names = {path.name for path in (run_dir / "checkpoints").iterdir()}
+    assert names == {
+        "checkpoint-000000024.json",
+        "checkpoint-000000024.safetensors",
+        *(f"deleted-{episode:09d}.json" for episode in (6, 12, 18)),
+    }
+
+
 def test_health_and_reflection(learner: tuple[str, Path]) -> None:
     with connect(learner[0]) as connection:
         health = health_pb2_grpc.HealthStub(connection)
@@ -356,6 +394,14 @@ def test_stop_saves_and_resume_goes_on(begin: list[str], resume: list[str], tmp_
     assert (ticket.episode_id, ticket.policy_version) == (8, 2)
     process.terminate()
     service.finish(process)
+
+
+def test_a_run_has_one_learner_at_a_time(learner: tuple[str, Path]) -> None:
+    _, run_dir = learner
+    before = (run_dir / "endpoints.json").read_bytes()
+    second = service.start("learner", "--resume", "--run-dir", str(run_dir), "--set", "learner.port=0")
+    assert "another process works in" in service.finish(second, code=2)
+    assert (run_dir / "endpoints.json").read_bytes() == before
 
 
 def test_a_busy_port_is_an_error_that_says_what_to_do(tmp_path: Path) -> None:

@@ -93,3 +93,37 @@ def test_bytes_that_are_no_weights_file_are_refused() -> None:
     garbage = b"\x05\0\0\0\0\0\0\0hello"
     with pytest.raises(CorruptError, match="not a safetensors"):
         checkpoint.unpack(garbage, sha256(garbage).hexdigest())
+
+
+@pytest.mark.parametrize("kind", ["folder", "memory"])
+def test_a_deleted_checkpoint_is_gone_and_its_number_taken(tmp_path: Path, kind: str) -> None:
+    url = str(tmp_path) if kind == "folder" else f"memory://{tmp_path}"
+    store = CheckpointStore(url)
+    for episode in (100, 200, 300):
+        store.publish(make_manifest(episode), DATA)
+    there = store.manifests
+    store.delete(200)
+    assert [manifest.episode for manifest in there] == [100, 200, 300]
+    for again in (store, CheckpointStore(url)):
+        assert [manifest.episode for manifest in again.manifests] == [100, 300]
+        assert again.frozen == 3
+        with pytest.raises(KeyError, match="checkpoint 200 was deleted"):
+            again.find(200)
+        assert not again.publish(make_manifest(200), DATA)
+        other = checkpoint.pack({"policy.fc1.bias": np.zeros(4, np.float32)})
+        with pytest.raises(CorruptError, match="checkpoint 200 exists with SHA-256"):
+            again.publish(make_manifest(200, other), other)
+        assert [manifest.episode for manifest in again.manifests] == [100, 300]
+
+
+def test_whoever_dies_while_deleting_leaves_a_checkpoint_deleted(tmp_path: Path) -> None:
+    """After the manifest has its new name, and before the weights are gone."""
+    store = CheckpointStore(str(tmp_path))
+    store.publish(make_manifest(100), DATA)
+    store.delete(100)
+    weights = tmp_path / "checkpoint-000000100.safetensors"
+    weights.write_bytes(DATA)
+    again = CheckpointStore(str(tmp_path))
+    assert again.manifests == []
+    assert again.frozen == 1
+    assert not weights.exists()

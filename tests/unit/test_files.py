@@ -1,10 +1,13 @@
 """Files that survive whoever dies while writing them."""
 
+import resource
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
-from liir_common.files import Table, write_atomic
+from liir_common.files import Table, remove_leftovers, write_atomic
 
 
 def test_a_failed_write_leaves_the_old_content_and_nothing_else(
@@ -62,3 +65,44 @@ def test_keep_drops_what_a_resumed_run_writes_again(tmp_path: Path) -> None:
     table.keep("step", 3)
     table.append({"step": 4})
     assert path.read_text().splitlines() == ["step", "1", "2", "3", "4"]
+
+
+@contextmanager
+def files_of_at_most(size: int) -> Iterator[None]:
+    """The operating system lets this process write no file beyond that size."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.mark.parametrize("room", [0, 3])
+def test_a_row_without_room_leaves_the_table_as_it_was(tmp_path: Path, room: int) -> None:
+    path = tmp_path / "table.csv"
+    table = Table(path)
+    table.append({"step": 1, "x": 0.5})
+    before = path.read_bytes()
+    with files_of_at_most(len(before) + room), pytest.raises(OSError, match=r"File too large|No space left"):
+        table.append({"step": 2, "x": 1.5})
+    assert path.read_bytes() == before
+    table.append({"step": 2, "x": 1.5})
+    assert path.read_text().splitlines() == ["step,x", "1,0.5", "2,1.5"]
+
+
+def test_a_new_column_without_room_leaves_the_table_as_it_was(tmp_path: Path) -> None:
+    path = tmp_path / "table.csv"
+    table = Table(path)
+    table.append({"step": 1})
+    with files_of_at_most(5), pytest.raises(OSError, match="File too large"):
+        table.append({"step": 2, "x": 1.5})
+    table.append({"step": 2, "x": 1.5})
+    assert path.read_text().splitlines() == ["step,x", "1,", "2,1.5"]
+
+
+def test_leftovers_of_the_dead_are_removed_and_nothing_else(tmp_path: Path) -> None:
+    for name in (".state-1.safetensors.a1b2c3d4", "state-1.safetensors", ".hidden"):
+        (tmp_path / name).touch()
+    remove_leftovers(tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".hidden", "state-1.safetensors"]

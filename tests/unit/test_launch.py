@@ -1,0 +1,63 @@
+"""What the launcher says of a process that died."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from liir_common.launch import Service
+
+PROGRAM = """
+import os, signal, sys
+import structlog
+from liir_common import logs
+from liir_common.errors import StorageError, exit_on_error
+
+logs.configure("test")
+structlog.get_logger().info("tested", episode=100)
+{last}
+"""
+
+
+class Program(Service):
+    """A process of the run whose program is its argument."""
+
+    @property
+    def command(self) -> list[str]:
+        return [sys.executable, "-c", *self.arguments]
+
+
+@pytest.mark.parametrize(
+    ("last", "parts"),
+    [
+        ("{}[7]", ["code 1 (an error that is not foreseen)", "'tested'", "last exception: KeyError: 7;"]),
+        (
+            "with exit_on_error():\n    raise StorageError('no room')",
+            ["code 6 (The run directory cannot be written to)", "last exception: error: no room;"],
+        ),
+        (
+            "os.kill(os.getpid(), signal.SIGKILL)",
+            ["code -9 (SIGKILL) in the phase 'tested'", "last exception: none in its log;", "episode"],
+        ),
+    ],
+)
+def test_an_obituary_has_code_phase_exception_and_log(tmp_path: Path, last: str, parts: list[str]) -> None:
+    log_path = tmp_path / "evaluator.log"
+    log_path.write_text("ValueError: of the incarnation before\n")
+    service = Program("evaluator", [PROGRAM.replace("{last}", last)], log_path)
+    service.start()
+    assert service.process
+    service.process.wait(30)
+    text = service.obituary()
+    assert text.startswith("the evaluator ended with")
+    for part in parts:
+        assert part in text
+    assert "incarnation before" not in text
+
+
+def test_what_the_learner_said_of_itself_counts_more_than_its_log(tmp_path: Path) -> None:
+    (tmp_path / "learner.log").touch()
+    service = Service("learner", [], tmp_path / "learner.log", phase="learner updates")
+    assert "in the phase 'learner updates'" in service.obituary()

@@ -65,7 +65,7 @@ dashboard: setup ## Write the Grafana dashboard from its program
 	$(BIN)/python deploy/grafana/dashboard.py > deploy/grafana/dashboards/liir.json
 
 PIN := UV_CUSTOM_COMPILE_COMMAND="make requirements" $(BIN)/uv pip compile --quiet --universal \
-	--python-version 3.11 --generate-hashes --no-annotate --no-emit-package torch $(ARGS)
+	--python-version 3.11 --generate-hashes --no-annotate -c requirements-torch.txt --no-emit-package torch $(ARGS)
 requirements: setup ## Pin what pyproject.toml asks for, with hashes (ARGS="--upgrade" takes new versions)
 	$(PIN) pyproject.toml --group build --extra service --extra animation --extra export -o requirements.txt
 	$(PIN) --group dev -c requirements.txt -o requirements-dev.txt

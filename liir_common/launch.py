@@ -119,6 +119,11 @@ class LocalService(Service):
     _log_begin: int = 0
     """Where in the log the present incarnation begins."""
 
+    @property
+    def command(self) -> list[str]:
+        """What starts it."""
+        return [sys.executable, "-m", f"services.{self.name}", *self.arguments]
+
     def start(self) -> None:
         """Start it in a process group of its own, so that Ctrl-C reaches only the launcher."""
         self.phase = ""
@@ -126,7 +131,7 @@ class LocalService(Service):
         with self.log_path.open("ab") as file:
             self._log_begin = file.tell()
             self._process = subprocess.Popen(
-                [sys.executable, "-m", f"services.{self.name}", *self.arguments],
+                self.command,
                 stdout=file,
                 stderr=file,
                 stdin=subprocess.DEVNULL,

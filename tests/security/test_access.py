@@ -150,9 +150,16 @@ def test_every_method_that_is_served_has_its_line_in_the_table() -> None:
 
 @needs_grpcurl
 def test_grpcurl_with_a_token(learner: str, certs: Path) -> None:
-    secret = tokens.Tokens(str(certs / "tokens")).own(Role.READER).secret
-    tls = ["-cacert", str(certs / "ca.pem"), "-cert", str(certs / "client.pem")]
-    tls += ["-key", str(certs / "client-key.pem")]
+    reader = certs / "reader"
+    secret = tokens.Tokens(str(reader / "tokens")).own(Role.READER).secret
+    tls = [
+        "-cacert",
+        str(reader / "ca.pem"),
+        "-cert",
+        str(reader / "cert.pem"),
+        "-key",
+        str(reader / "key.pem"),
+    ]
     listed = grpcurl(*tls, "-H", f"authorization: Bearer {secret}", learner, "list")
     assert "liir.v1.CheckpointService" in listed.stdout.split(), listed.stderr
     assert "got none" in grpcurl(*tls, learner, "list").stderr

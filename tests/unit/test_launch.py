@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from liir_common.launch import Service
+from liir_common.launch import LocalService
+from tests.e2e.service import wait_for
 
 PROGRAM = """
 import os, signal, sys
@@ -21,7 +22,7 @@ structlog.get_logger().info("tested", episode=100)
 """
 
 
-class Program(Service):
+class Program(LocalService):
     """A process of the run whose program is its argument."""
 
     @property
@@ -44,12 +45,11 @@ class Program(Service):
     ],
 )
 def test_an_obituary_has_code_phase_exception_and_log(tmp_path: Path, last: str, parts: list[str]) -> None:
-    log_path = tmp_path / "evaluator.log"
-    log_path.write_text("ValueError: of the incarnation before\n")
-    service = Program("evaluator", [PROGRAM.replace("{last}", last)], log_path)
+    service = Program("evaluator", [PROGRAM.replace("{last}", last)], tmp_path)
+    service.log_path.parent.mkdir()
+    service.log_path.write_text("ValueError: of the incarnation before\n")
     service.start()
-    assert service.process
-    service.process.wait(30)
+    wait_for(lambda: service.exit_code is not None, "the end of the program")
     text = service.obituary()
     assert text.startswith("the evaluator ended with")
     for part in parts:
@@ -58,6 +58,8 @@ def test_an_obituary_has_code_phase_exception_and_log(tmp_path: Path, last: str,
 
 
 def test_what_the_learner_said_of_itself_counts_more_than_its_log(tmp_path: Path) -> None:
-    (tmp_path / "learner.log").touch()
-    service = Service("learner", [], tmp_path / "learner.log", phase="learner updates")
+    service = LocalService("learner", [], tmp_path)
+    service.log_path.parent.mkdir()
+    service.log_path.touch()
+    service.phase = "learner updates"
     assert "in the phase 'learner updates'" in service.obituary()

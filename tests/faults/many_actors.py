@@ -15,7 +15,7 @@ if __name__ == "__main__":
     address, count = sys.argv[1], int(sys.argv[2])
     config = learners_config(address, (), PLAINTEXT, Role.ACTOR)
     warm_up(config.env)
-    actors = [RolloutActor(f"actor-{number:03d}", 0, address, config.tree()) for number in range(count)]
+    actors = [RolloutActor(f"actor-{number:03d}", 0, address, config.tree(), {}) for number in range(count)]
     threads = [threading.Thread(target=actor.run) for actor in actors]
     for thread in threads:
         thread.start()

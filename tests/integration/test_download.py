@@ -166,7 +166,7 @@ def test_another_process_goes_on_where_the_last_one_was_cut(store: Store, tmp_pa
     part = f".{store.manifest.sha256}.part"
     with store.served() as address:
         with (
-            cutting(address, limit=2 * CHUNK, connections=1) as shaky,
+            cutting(address, limit=len(store.data) // 2, connections=1) as shaky,
             CheckpointClient(shaky) as client,
             pytest.raises(UnreachableError, match="the download broke 5 times"),
         ):

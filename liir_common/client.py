@@ -157,7 +157,9 @@ class CheckpointClient:
         Raises:
             LiirError: no checkpoint has been tested yet.
         """
-        best = max(self.evaluations(), key=_merit, default=None)
+        there = {frozen.episode for frozen in self.list()}
+        tested = (evaluation for evaluation in self.evaluations() if evaluation.episode in there)
+        best = max(tested, key=merit, default=None)
         if best is None:
             raise LiirError("no checkpoint has been tested yet; wait for the evaluator")
         return best
@@ -221,7 +223,8 @@ class CheckpointClient:
         return manifest
 
 
-def _merit(evaluation: checkpoint_pb2.Evaluation) -> tuple[float, ...]:
+def merit(evaluation: checkpoint_pb2.Evaluation) -> tuple[float, ...]:
+    """What is greater for a better checkpoint: greedy, then sampled win rate, greedy return, episode."""
     greedy, sampled = evaluation.greedy, evaluation.sampled
     rates = (tested.wins / tested.episodes for tested in (greedy, sampled))
     return *rates, greedy.return_mean, evaluation.episode

@@ -197,7 +197,7 @@ class CheckpointsConfig(Section):
     keep_every: int = Field(0, ge=0)
     """Every so many-th of all that were frozen; 0 for none."""
     keep_best: int = Field(1, ge=0)
-    """So many best ones, by greedy win rate, then sampled win rate, then the newer."""
+    """So many best ones, as `client.merit` ranks them."""
 
 
 class ActorsConfig(Section):

@@ -126,7 +126,6 @@ class LocalService(Service):
 
     def start(self) -> None:
         """Start it in a process group of its own, so that Ctrl-C reaches only the launcher."""
-        self.phase = ""
         self.log_path.parent.mkdir(parents=True, exist_ok=True)
         with self.log_path.open("ab") as file:
             self._log_begin = file.tell()
@@ -296,6 +295,7 @@ class Launcher:
             if code in _IN_VAIN or not service.may_restart():
                 self._raise_death(service)
             log.error("a process died; it is started again", reason=service.obituary())
+            service.phase = ""
             service.start()
 
     def _stop(self, training: TrainingClient) -> None:

@@ -71,9 +71,15 @@ def _latest(run_dir: Path) -> Path:
 
 def _best(run_dir: Path) -> Path:
     """As `CheckpointClient.best`."""
-    tests = read_table(run_dir / "evaluations.csv")
-    if not tests:
-        raise ConfigError(f"{run_dir} holds no evaluation; leave out --best to take the latest checkpoint")
+    folder = run_dir / "checkpoints"
+    tests = {
+        folder / f"checkpoint-{int(t['episode']):09d}.json": t
+        for t in read_table(run_dir / "evaluations.csv")
+    }
+    there = [path for path in tests if path.exists()]
+    if not there:
+        raise ConfigError(
+            f"{run_dir} holds no tested checkpoint; leave out --best to take the latest checkpoint"
+        )
     keys = ("greedy_win_rate", "sampled_win_rate", "greedy_return_mean", "episode")
-    best = max(tests, key=lambda test: [float(test[key]) for key in keys])
-    return run_dir / "checkpoints" / f"checkpoint-{int(best['episode']):09d}.json"
+    return max(there, key=lambda path: [float(tests[path][key]) for key in keys])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from liir_common.checkpoint import Manifest
+from liir_common.client import merit
 from liir_common.config import Config
 from liir_common.rpc.gen.liir.v1 import checkpoint_pb2
 
@@ -25,12 +26,6 @@ def superseded(
     if rules.keep_every:
         step = rules.keep_every * config.training.checkpoint_interval
         kept |= {episode for episode in episodes if episode % step == 0}
-    kept |= set(sorted(tested, key=lambda episode: _merit(evaluations[episode]))[::-1][: rules.keep_best])
+    kept |= set(sorted(tested, key=lambda episode: merit(evaluations[episode]))[::-1][: rules.keep_best])
     may_go = tested if config.evaluation.enabled else episodes
     return [episode for episode in may_go if episode not in kept]
-
-
-def _merit(evaluation: checkpoint_pb2.Evaluation) -> tuple[float, float, int]:
-    """The order in which `liir replay --best` chooses."""
-    greedy, sampled = evaluation.greedy, evaluation.sampled
-    return greedy.wins / greedy.episodes, sampled.wins / sampled.episodes, evaluation.episode

@@ -20,8 +20,9 @@ import psutil
 
 from tests.e2e import service
 
+ACTORS = 8
 SETTINGS = (
-    "actors.count=8",
+    f"actors.count={ACTORS}",
     "training.total_env_steps=1000000000",
     "training.batch_episodes=32",
     "training.checkpoint_interval=100",
@@ -57,12 +58,13 @@ def measure(run_dir: Path, minutes: float) -> tuple[Samples, int]:
     samples: Samples = defaultdict(list)
     with service.training(run_dir, *SETTINGS) as training:
         service.wait_for(lambda: service.learner_step(run_dir) > 0, "the first learner step")
-        found = {
-            f"{name} {number}" if name == "actor" else name: process
-            for name, command in PROCESSES.items()
-            for number, process in enumerate(service.descendants(training, command))
-        }
         with service.client(run_dir) as client:
+            service.wait_for(lambda: client.status().actors == ACTORS, "the last actor")
+            found = {
+                f"{name} {number}" if name == "actor" else name: process
+                for name, command in PROCESSES.items()
+                for number, process in enumerate(service.descendants(training, command))
+            }
             begin = time.monotonic()
             while (now := time.monotonic() - begin) < 60 * minutes:
                 for name, process in found.items():

@@ -214,8 +214,11 @@ def test_the_best_checkpoint_is_the_one_that_wins_most(run_dir: Path, tmp_path: 
     assert find_checkpoint(None, run_dir).stem == "checkpoint-000000300"
     (tmp_path / "evaluations.csv").write_text(
         "episode,greedy_win_rate,sampled_win_rate,greedy_return_mean\n"
-        "100,0.9,1.0,20\n200,1.0,0.85,18\n300,1.0,0.85,17\n900,1.0,0.8,20\n1000,0.95,1.0,20\n"
+        "100,0.9,1.0,20\n200,1.0,0.85,18\n300,1.0,0.85,17\n400,1.0,1.0,20\n900,1.0,0.8,20\n1000,0.95,1.0,20\n"
     )
+    (tmp_path / "checkpoints").mkdir()
+    for episode in (100, 200, 300, 900, 1000):  # 400 was deleted
+        (tmp_path / "checkpoints" / f"checkpoint-{episode:09d}.json").touch()
     assert find_checkpoint(None, tmp_path, best=True).stem == "checkpoint-000000200"
 
 
@@ -226,7 +229,7 @@ def test_the_best_checkpoint_is_the_one_that_wins_most(run_dir: Path, tmp_path: 
         ((Path("a"), Path("b")), "wanted either --checkpoint FILE or --run-dir"),
         ((Path("a"), None, True), "--best chooses among"),
         ((None, Path("nowhere")), "nowhere holds no checkpoint"),
-        ((None, Path("nowhere"), True), "nowhere holds no evaluation"),
+        ((None, Path("nowhere"), True), "nowhere holds no tested checkpoint"),
     ],
 )
 def test_what_cannot_be_found_says_why(arguments: Any, message: str) -> None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from liir_common import kernel_cache, seeds
 
-# Here, because every module with kernels imports this one first.
+# Before the first kernel: every module with kernels imports this one or `rollout.dense` first.
 kernel_cache.install()
 
 Stream = NDArray[np.uint64]

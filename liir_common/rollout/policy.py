@@ -1,17 +1,13 @@
-"""The policy FC - ReLU - GRU - FC and its exploration as compiled float32 code.
-
-Only `contract` of fast-math is on: a product and a sum may fuse, nothing may change order, so equal
-inputs give equal bytes on equal machines.
-"""
+"""The policy FC - ReLU - GRU - FC and its exploration as compiled float32 code; `dense` has the rules."""
 
 import math
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from liir_common import rng
+from liir_common.rollout.dense import add_product, aligned, sigmoid, tanh
 from liir_common.types import EnvSpec, Exploration, FloatArray, Weights, policy_shapes
 
 SOFTMAX_FLOOR, EPSILON_GREEDY, GREEDY = 0, 1, 2
@@ -78,19 +74,19 @@ def pack(weights: Weights, spec: EnvSpec, hidden: int = 64) -> Policy:
     n, actions, width = spec.n_agents, spec.n_actions, spec.obs_dim
     fc1 = weights["fc1.weight"].T
     return Policy(
-        fc1_obs=_aligned(fc1[:width]),
-        fc1_action=_aligned(fc1[width : width + actions]),
-        fc1_agent=_aligned(fc1[width + actions :] + weights["fc1.bias"]),
-        gru_input=_aligned(weights["gru.weight_ih"].T),
-        gru_input_bias=_aligned(weights["gru.bias_ih"]),
-        gru_hidden=_aligned(weights["gru.weight_hh"].T),
-        gru_hidden_bias=_aligned(weights["gru.bias_hh"]),
-        fc2=_aligned(weights["fc2.weight"].T),
-        fc2_bias=_aligned(weights["fc2.bias"]),
-        features=_aligned(np.zeros((n, hidden))),
-        input_gates=_aligned(np.zeros((n, 3 * hidden))),
-        hidden_gates=_aligned(np.zeros((n, 3 * hidden))),
-        logits=_aligned(np.zeros((n, actions))),
+        fc1_obs=aligned(fc1[:width]),
+        fc1_action=aligned(fc1[width : width + actions]),
+        fc1_agent=aligned(fc1[width + actions :] + weights["fc1.bias"]),
+        gru_input=aligned(weights["gru.weight_ih"].T),
+        gru_input_bias=aligned(weights["gru.bias_ih"]),
+        gru_hidden=aligned(weights["gru.weight_hh"].T),
+        gru_hidden_bias=aligned(weights["gru.bias_hh"]),
+        fc2=aligned(weights["fc2.weight"].T),
+        fc2_bias=aligned(weights["fc2.bias"]),
+        features=aligned(np.zeros((n, hidden))),
+        input_gates=aligned(np.zeros((n, 3 * hidden))),
+        hidden_gates=aligned(np.zeros((n, 3 * hidden))),
+        logits=aligned(np.zeros((n, actions))),
     )
 
 
@@ -100,16 +96,6 @@ def random_weights(spec: EnvSpec, hidden: int, seed: int) -> Weights:
     bound = hidden**-0.5
     shapes = policy_shapes(spec, hidden)
     return {name: random.uniform(-bound, bound, shape).astype(np.float32) for name, shape in shapes.items()}
-
-
-def _aligned(values: NDArray[np.floating]) -> FloatArray:
-    """A float32 copy at the start of a cache line; loads that span two lines cost a quarter of the speed."""
-    line = 64
-    memory = np.empty(values.size * 4 + line, np.uint8)
-    start = -memory.ctypes.data % line
-    copy = memory[start : start + values.size * 4].view(np.float32).reshape(values.shape)
-    copy[...] = values
-    return copy
 
 
 def _check(weights: Weights, shapes: dict[str, tuple[int, ...]]) -> None:
@@ -130,53 +116,7 @@ def _check(weights: Weights, shapes: dict[str, tuple[int, ...]]) -> None:
             )
 
 
-# Numerators and denominators of tanh as a 13/6 rational function, as Eigen has it; beyond the bound
-# float32 tanh is 1.
-_BOUND = np.float32(7.90531110763549805)
-_A1, _A3, _A5, _A7 = map(
-    np.float32, (4.89352455891786e-03, 6.37261928875436e-04, 1.48572235717979e-05, 5.12229709037114e-08)
-)
-_A9, _A11, _A13 = map(np.float32, (-8.60467152213735e-11, 2.00018790482477e-13, -2.76076847742355e-16))
-_B0, _B2, _B4, _B6 = map(
-    np.float32, (4.89352518554385e-03, 2.26843463243900e-03, 1.18534705686654e-04, 1.19825839466702e-06)
-)
-_HALF, _ZERO = np.float32(0.5), np.float32(0)
-
-
-@njit(inline="always")
-def _tanh(x):
-    x = min(max(x, -_BOUND), _BOUND)
-    s = x * x
-    numerator = x * (_A1 + s * (_A3 + s * (_A5 + s * (_A7 + s * (_A9 + s * (_A11 + s * _A13))))))
-    return numerator / (_B0 + s * (_B2 + s * (_B4 + s * _B6)))
-
-
-@njit(inline="always")
-def _sigmoid(x):
-    return _HALF + _HALF * _tanh(_HALF * x)
-
-
-@njit(cache=True, fastmath={"contract"})
-def _add_product(x, weight, out):
-    """out[n, columns] += x[n, rows] @ weight[rows, columns].
-
-    Four rows of the weight serve all agents while they are in the first-level cache, and each pass
-    over `out` does four fused multiply-adds per load and store.
-    """
-    n, rows = x.shape
-    columns = weight.shape[1]
-    by_four = rows - rows % 4
-    for i in range(0, by_four, 4):
-        for a in range(n):
-            x0, x1, x2, x3 = x[a, i], x[a, i + 1], x[a, i + 2], x[a, i + 3]
-            for j in range(columns):
-                # From left to right, so that each product has one sum to fuse with.
-                even = out[a, j] + x0 * weight[i, j] + x1 * weight[i + 1, j]
-                out[a, j] = even + x2 * weight[i + 2, j] + x3 * weight[i + 3, j]
-    for i in range(by_four, rows):
-        for a in range(n):
-            for j in range(columns):
-                out[a, j] += x[a, i] * weight[i, j]
+_ZERO = np.float32(0)
 
 
 @njit(cache=True)
@@ -185,7 +125,7 @@ def _affine(x, weight, bias, out):
     for a in range(out.shape[0]):
         for j in range(out.shape[1]):
             out[a, j] = bias[j]
-    _add_product(x, weight, out)
+    add_product(x, weight, out)
 
 
 @njit(cache=True, fastmath={"contract"})
@@ -199,10 +139,16 @@ def _embed(policy, obs, last_actions):
         if last_actions[a] >= 0:
             for j in range(units):
                 features[a, j] += policy.fc1_action[last_actions[a], j]
-    _add_product(obs, policy.fc1_obs, features)
+    add_product(obs, policy.fc1_obs, features)
     for a in range(n):
         for j in range(units):
             features[a, j] = max(features[a, j], _ZERO)
+
+
+@njit(inline="always")
+def _gates(sums, units):
+    """The parts r, z, n of [3H]."""
+    return sums[:units], sums[units : 2 * units], sums[2 * units :]
 
 
 # Python's check for division by zero would keep the loop over units from vectorising.
@@ -213,12 +159,14 @@ def _recur(policy, hidden):
     _affine(policy.features, policy.gru_input, policy.gru_input_bias, policy.input_gates)
     _affine(hidden, policy.gru_hidden, policy.gru_hidden_bias, policy.hidden_gates)
     for a in range(len(hidden)):
-        x, h = policy.input_gates[a], policy.hidden_gates[a]
+        x_reset, x_update, x_new = _gates(policy.input_gates[a], units)
+        h_reset, h_update, h_new = _gates(policy.hidden_gates[a], units)
+        h = hidden[a]
         for j in range(units):
-            reset = _sigmoid(x[j] + h[j])
-            update = _sigmoid(x[units + j] + h[units + j])
-            new = _tanh(x[2 * units + j] + reset * h[2 * units + j])
-            hidden[a, j] = new + update * (hidden[a, j] - new)
+            x_new[j] += sigmoid(x_reset[j] + h_reset[j]) * h_new[j]
+        for j in range(units):
+            new = tanh(x_new[j])
+            h[j] = new + sigmoid(x_update[j] + h_update[j]) * (h[j] - new)
 
 
 @njit(cache=True)

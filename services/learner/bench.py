@@ -33,7 +33,7 @@ def bench_learner(
     """Time learner steps on the CPU against their floor, the time of their matrix products alone.
 
     The products, with sizes and memory layouts, are recorded from a real update and run again by themselves,
-    with the same threads in the same run. Floating point operations are two per multiply-add.
+    in float32, with the same threads in the same run. Floating point operations are two per multiply-add.
 
     Returns:
         env_steps and flops of the batch, and under "threads" for each count the medians update_ms, cpu_ms
@@ -42,9 +42,11 @@ def bench_learner(
     """
     batch = synthetic_batch(spec, episodes, steps, seed=0)
     learner = make_algorithm(spec, algorithm, 0, torch.device("cpu"))
-    learner.update(batch)
+    # In float64 every product is torch's, those that are compiled in float32 as well.
+    recorded = make_algorithm(spec, algorithm, 0, torch.device("cpu"), torch.float64)
+    recorded.update(batch)
     with _Products() as products:
-        learner.update(batch)
+        recorded.update(batch)
     flops = sum(_flops(a, b) * times for (a, b), times in products.seen.items())
     before = torch.get_num_threads()
     results = {}

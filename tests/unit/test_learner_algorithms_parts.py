@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from numba import jit
 from torch import Tensor
 
 from liir_common.config import OptimizerConfig
 from liir_common.types import Batch, EnvSpec
-from services.learner.algorithms import gru
+from services.learner.algorithms import gru, gru_compiled
 from services.learner.algorithms.data import Data, prepare
 from services.learner.algorithms.networks import AgentValue, fit_width, initial
 from services.learner.algorithms.optim import Optimizer
@@ -128,6 +130,46 @@ def test_gru_and_its_derivatives_equal_torch() -> None:
     h_dot = gru.forward_derivative(trace, arguments[1], tangents[0], recurrent)
     both_ways = sum(float((g * t).sum()) for g, t in zip(wanted, tangents, strict=True))
     assert float((h_dot * cotangent).sum()) == pytest.approx(both_ways, rel=1e-12)
+
+
+@pytest.mark.parametrize("threads", [1, 2, 9])
+def test_compiled_gru_and_its_derivatives_equal_the_eager_ones(
+    monkeypatch: pytest.MonkeyPatch, threads: int
+) -> None:
+    """With units left over from the unrolled loops, and with more threads than lives."""
+    width, sizes = 13, [7, 7, 5, 2, 2, 1]
+    rows = sum(sizes)
+
+    def run(dtype: torch.dtype) -> list[Tensor]:
+        inputs, weight, bias_n, grad_h, d_inputs, d_recurrent = (
+            random(*shape, seed=k).to(dtype)
+            for k, shape in enumerate(
+                [(rows, 3 * width), (3 * width, width), (width,), (rows, width)] + [(rows, 3 * width)] * 2
+            )
+        )
+        trace = gru.forward(inputs, weight, bias_n, sizes)
+        gradients = gru.backward(trace, weight, grad_h)
+        h_dot = gru.forward_derivative(trace, weight, d_inputs, d_recurrent)
+        parts = [trace.h, trace.previous, trace.z, trace.to_n, trace.to_gates]
+        return [*(x.clone() for x in parts), *gradients, h_dot]
+
+    wanted = run(torch.float64)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
+    compiled = run(torch.float32)
+    for a, b in zip(compiled, wanted, strict=True):
+        torch.testing.assert_close(a.double(), b, rtol=2e-5, atol=2e-5)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 1)
+    assert all(torch.equal(a, b) for a, b in zip(compiled, run(torch.float32), strict=True))
+
+
+def test_the_rows_of_the_compiled_gru_are_compiled_to_vectors() -> None:
+    # Code from numba's cache cannot be inspected.
+    step = gru_compiled._step
+    compiled = jit(**step.targetoptions)(step.py_func)
+    units, gates = (np.zeros(width, np.float32) for width in (64, 192))
+    compiled(gates, gates.copy(), units, units.copy(), units.copy(), units.copy(), gates.copy())
+    (code,) = compiled.inspect_llvm().values()
+    assert len(re.findall(r"fdiv contract <\d+ x float>", code)) >= 3
 
 
 @pytest.mark.parametrize("name", ["adam", "rmsprop"])

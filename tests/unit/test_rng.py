@@ -1,6 +1,7 @@
 """Compiled random streams: the same numbers as plain Python, apart from each other, uniform; and
 never those of a version of the package that is gone."""
 
+import hashlib
 import importlib
 import os
 import shutil
@@ -14,6 +15,7 @@ from numba.core.caching import FunctionCache
 from numba.core.dispatcher import Dispatcher
 
 from liir_common import build, rng, seeds
+from services.learner.algorithms import gru_compiled
 
 EDGES = [0, 1, 2, 12345, 2**31, 2**63 - 1, 2**63, 2**64 - 1]
 
@@ -89,11 +91,24 @@ def test_code_compiled_before_a_change_of_another_file_is_not_used(tmp_path: Pat
     assert run().split() == ["True", "0"]
 
 
-def test_every_cached_kernel_of_the_package_is_watched() -> None:
-    for name in ("rng", "battle.engine", "battle.observation", "battle.policies", "rollout.policy"):
-        module = importlib.import_module(f"liir_common.{name}")
-        kernels = [value for value in vars(module).values() if isinstance(value, Dispatcher)]
-        cached = [kernel for kernel in kernels if isinstance(kernel._cache, FunctionCache)]
-        assert cached
-        stamps = {kernel._cache._impl.locator.get_source_stamp() for kernel in cached}
-        assert stamps == {build.source_digest()}
+def cache_stamps(module_name: str) -> set[str]:
+    module = importlib.import_module(module_name)
+    kernels = [value for value in vars(module).values() if isinstance(value, Dispatcher)]
+    cached = [kernel for kernel in kernels if isinstance(kernel._cache, FunctionCache)]
+    return {kernel._cache._impl.locator.get_source_stamp() for kernel in cached}
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["rng", "battle.engine", "battle.observation", "battle.policies", "rollout.policy", "rollout.dense"],
+)
+def test_every_cached_kernel_of_the_package_is_watched(name: str) -> None:
+    assert cache_stamps(f"liir_common.{name}") == {build.source_digest()}
+
+
+def test_kernels_of_the_learner_watch_their_own_file_and_what_they_take_from_the_package() -> None:
+    module = Path(gru_compiled.__file__)
+    own = hashlib.sha256(module.read_bytes()).hexdigest()
+    stamps = cache_stamps("services.learner.algorithms.gru_compiled")
+    # `add_product` among them is the package's.
+    assert stamps == {build.source_digest(), build.source_digest() + own}

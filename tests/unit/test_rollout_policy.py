@@ -9,6 +9,7 @@ import pytest
 import torch
 from numba import jit
 
+from liir_common.rollout.dense import add_product
 from liir_common.rollout.policy import (
     EPSILON_GREEDY,
     GREEDY,
@@ -16,7 +17,6 @@ from liir_common.rollout.policy import (
     SOFTMAX_FLOOR,
     Choice,
     Policy,
-    _add_product,
     _recur,
     act,
     first_stuck,
@@ -229,12 +229,12 @@ def test_packing_copies() -> None:
     assert not any(np.shares_memory(array, given) for array in policy for given in weights.values())
 
 
-@pytest.mark.parametrize(("kernel", "instruction"), [(_add_product, "fmul"), (_recur, "fdiv")])
+@pytest.mark.parametrize(("kernel", "instruction"), [(add_product, "fmul"), (_recur, "fdiv")])
 def test_the_inner_loops_are_compiled_to_vectors(kernel: Any, instruction: str) -> None:
     policy = pack(random_weights(SPEC, 64, 0), SPEC)
     # Code from numba's cache cannot be inspected.
     compiled = jit(**kernel.targetoptions)(kernel.py_func)
-    if kernel is _add_product:
+    if kernel is add_product:
         compiled(policy.features, policy.gru_input, policy.input_gates)
     else:
         compiled(policy, np.zeros((3, 64), np.float32))

@@ -9,14 +9,20 @@ Around a trace the step h' = f(h, inputs) is linear in its tangents,
 
 where gi are the projected inputs and gh the recurrent sums. `backward` runs this recurrence towards the
 past, `forward_derivative` towards the future.
+
+What goes from step to step is compiled for float32 on the CPU (`gru_compiled`), where dispatching small
+operations cost more than their arithmetic, and made of torch's operations elsewhere (`gru_eager`).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import ModuleType
 
 import torch
 from torch import Tensor
+
+from services.learner.algorithms import gru_compiled, gru_eager
 
 
 @dataclass(frozen=True)
@@ -36,6 +42,11 @@ class Trace:
     """[R, 3, H]"""
 
 
+def _recurrences(tensor: Tensor) -> ModuleType:
+    compiled = tensor.dtype == torch.float32 and tensor.device.type == "cpu"
+    return gru_compiled if compiled else gru_eager
+
+
 def forward(inputs: Tensor, weight: Tensor, bias_n: Tensor, sizes: list[int]) -> Trace:
     """Run from h = 0.
 
@@ -45,37 +56,7 @@ def forward(inputs: Tensor, weight: Tensor, bias_n: Tensor, sizes: list[int]) ->
         bias_n: [H], recurrent bias of gate n
         sizes: how many sequences have a step t; never grows, sums to R
     """
-    width = weight.shape[1]
-    # Gate n's input stays apart, for r multiplies its recurrent sum alone; one product adds all three sums.
-    n = inputs[:, 2 * width :].clone()
-    inputs[:, 2 * width :] = bias_n
-    rz, recurrent_n = inputs[:, : 2 * width], inputs[:, 2 * width :]
-    r, z = rz.chunk(2, 1)
-    h_all, transposed = torch.empty_like(n), weight.t()
-    h = inputs.new_zeros(sizes[0], width)
-    in_steps = (x.split_with_sizes(sizes) for x in (inputs, rz, r, z, recurrent_n, n, h_all))
-    for sums_t, rz_t, r_t, z_t, recurrent_t, n_t, h_t in zip(*in_steps, strict=True):
-        h = h[: len(h_t)]
-        sums_t.addmm_(h, transposed)
-        rz_t.sigmoid_()
-        n_t.addcmul_(r_t, recurrent_t).tanh_()
-        h = torch.lerp(n_t, h, z_t, out=h_t)
-    before = zip(h_all.split_with_sizes(sizes), sizes[1:], strict=False)
-    previous = torch.cat([torch.zeros_like(h_all[: sizes[0]]), *(h_t[:size] for h_t, size in before)])
-    to_n, to_gates = _linearise(previous, r, z, n, recurrent_n)
-    return Trace(sizes, h_all, previous, z, to_n, to_gates)
-
-
-def _linearise(
-    previous: Tensor, r: Tensor, z: Tensor, n: Tensor, recurrent_n: Tensor
-) -> tuple[Tensor, Tensor]:
-    """to_n [R, H] and to_gates [R, 3, H]; x - x² is the sigmoid's derivative, 1 - n² that of tanh."""
-    to_n = torch.addcmul(z.new_ones(()), n, n, value=-1).mul_(1 - z)
-    to_gates = z.new_empty(len(z), 3, z.shape[1])
-    torch.mul(torch.addcmul(r, r, r, value=-1).mul_(recurrent_n), to_n, out=to_gates[:, 0])
-    torch.mul(torch.addcmul(z, z, z, value=-1), previous - n, out=to_gates[:, 1])
-    torch.mul(to_n, r, out=to_gates[:, 2])
-    return to_n, to_gates
+    return Trace(sizes, *_recurrences(inputs).forward(inputs, weight, bias_n, sizes))
 
 
 def backward(trace: Trace, weight: Tensor, grad_h: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -83,14 +64,9 @@ def backward(trace: Trace, weight: Tensor, grad_h: Tensor) -> tuple[Tensor, Tens
 
     `grad_h` [R, H], the gradient by the hidden states, is overwritten.
     """
-    sizes, grad_gates = trace.sizes, torch.empty_like(trace.to_gates)
+    grad_gates = torch.empty_like(trace.to_gates)
+    _recurrences(grad_h).backward(trace.sizes, trace.z, trace.to_gates, weight, grad_h, grad_gates)
     gates = grad_gates.flatten(1)
-    in_steps = (grad_h, grad_h.unsqueeze(1), trace.z, trace.to_gates, grad_gates, gates)
-    h, h_1, z, to_gates, out, out_flat = (x.split_with_sizes(sizes) for x in in_steps)
-    for t in range(len(sizes) - 1, 0, -1):
-        torch.mul(h_1[t], to_gates[t], out=out[t])
-        h[t - 1][: sizes[t]].addcmul_(h[t], z[t]).addmm_(out_flat[t], weight)
-    torch.mul(h_1[0], to_gates[0], out=out[0])
     grad_weight, grad_bias = gates.t() @ trace.previous, gates.sum(0)
     # Gate n's input is not multiplied with r, as its recurrent sum is; the other gates' gradients agree.
     torch.mul(grad_h, trace.to_n, out=grad_gates[:, 2])
@@ -104,12 +80,7 @@ def forward_derivative(trace: Trace, weight: Tensor, inputs: Tensor, recurrent: 
     """
     width = weight.shape[1]
     recurrent[:, : 2 * width] += inputs[:, : 2 * width]
-    h_dots = (recurrent.view_as(trace.to_gates) * trace.to_gates).sum(1)
-    h_dots.addcmul_(trace.to_n, inputs[:, 2 * width :])
-    h_dot = h_dots.new_zeros(trace.sizes[0], width)
-    in_steps = (x.split_with_sizes(trace.sizes) for x in (h_dots, trace.z, trace.to_gates))
-    for h_dot_t, z_t, to_gates_t in zip(*in_steps, strict=True):
-        h_dot = h_dot[: len(h_dot_t)]
-        through_gates = (h_dot @ weight.t()).view_as(to_gates_t).mul_(to_gates_t).sum(1)
-        h_dot = h_dot_t.addcmul_(z_t, h_dot).add_(through_gates)
-    return h_dots
+    h_dot = (recurrent.view_as(trace.to_gates) * trace.to_gates).sum(1)
+    h_dot.addcmul_(trace.to_n, inputs[:, 2 * width :])
+    _recurrences(h_dot).forward_derivative(trace.sizes, trace.z, trace.to_gates, weight, h_dot)
+    return h_dot

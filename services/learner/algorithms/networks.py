@@ -149,6 +149,12 @@ class CounterfactualValue(Mlp):
         super().__init__(inputs, 128, spec.n_actions)
 
 
+def relu_backward_(grad: Tensor, out: Tensor) -> Tensor:
+    """The gradient by what entered a ReLU, in place of `grad`, that by its output `out`."""
+    torch.ops.aten.threshold_backward.grad_input(grad, out, 0, grad_input=grad)
+    return grad
+
+
 class _Above(torch.autograd.Function):
     """The layers above the first, from its outputs [M, H] before the ReLU; written out because autograd's
     own ReLUs cost as much as the matrix products."""
@@ -163,8 +169,8 @@ class _Above(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, ...]:
         h1, h2, w2, w3 = ctx.saved_tensors
-        by_h2 = torch.ops.aten.threshold_backward(grad @ w3, h2, 0)
-        by_h1 = torch.ops.aten.threshold_backward(by_h2 @ w2, h1, 0)
+        by_h2 = relu_backward_(grad @ w3, h2)
+        by_h1 = relu_backward_(by_h2 @ w2, h1)
         return by_h1, by_h2.t() @ h1, by_h2.sum(0), grad.t() @ h2, grad.sum(0)
 
 

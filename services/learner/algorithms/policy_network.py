@@ -15,7 +15,7 @@ from torch.nn import functional
 from liir_common.types import EnvSpec, policy_shapes
 from services.learner.algorithms import gru
 from services.learner.algorithms.data import Data
-from services.learner.algorithms.networks import views
+from services.learner.algorithms.networks import relu_backward_, views
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class PolicyNetwork:
         grad["gru.bias_hh"].copy_(bias_hh)
         torch.mm(gates.t(), trace.x, out=grad["gru.weight_ih"])
         torch.sum(gates, 0, out=grad["gru.bias_ih"])
-        grad_x = (gates @ p["gru.weight_ih"]).mul_(trace.x.sign())
+        grad_x = relu_backward_(gates @ p["gru.weight_ih"], trace.x)
         torch.mm(grad_x.t(), trace.inputs, out=grad["fc1.weight"])
         torch.sum(grad_x, 0, out=grad["fc1.bias"])
         return out
@@ -71,7 +71,7 @@ class PolicyNetwork:
     def forward_derivative(self, theta: Tensor, trace: Trace, direction: Tensor) -> Tensor:
         """How the logits [A, R] change as θ moves along `direction` [P]."""
         p, d = views(theta, self.shapes), views(direction, self.shapes)
-        x = functional.linear(trace.inputs, d["fc1.weight"], d["fc1.bias"]).mul_(trace.x.sign())
+        x = relu_backward_(functional.linear(trace.inputs, d["fc1.weight"], d["fc1.bias"]), trace.x)
         inputs = functional.linear(trace.x, d["gru.weight_ih"], d["gru.bias_ih"])
         inputs.addmm_(x, p["gru.weight_ih"].t())
         recurrent = functional.linear(trace.gru.previous, d["gru.weight_hh"], d["gru.bias_hh"])

@@ -64,7 +64,7 @@ TICKETS_REISSUED = LEARNER.counter(
     "liir_tickets_reissued_total", "Tickets given to another actor", ["reason"]
 )
 DUPLICATES = LEARNER.counter("liir_duplicate_trajectories_total", "Trajectories that had come before")
-RECEIVED_BYTES = LEARNER.counter("liir_trajectory_bytes_total", "Bytes of trajectories received")
+RECEIVED_BYTES = LEARNER.counter("liir_trajectory_bytes_total", "Bytes of trajectories received, unpacked")
 ACTOR_PLAY_SECONDS = LEARNER.counter("liir_actor_play_seconds_total", "Seconds all actors spent playing")
 ACTOR_WAIT_SECONDS = LEARNER.counter("liir_actor_wait_seconds_total", "Seconds all actors waited for tickets")
 ACTOR_MEMORY = LEARNER.gauge("liir_actor_peak_memory_bytes", "Peak resident memory, connected actors' sum")

@@ -132,6 +132,11 @@ class Trajectory:
         """Number of steps T."""
         return len(self.reward)
 
+    @property
+    def nbytes(self) -> int:
+        """Size of all arrays."""
+        return sum(getattr(self, name).nbytes for name in TRAJECTORY_ARRAYS)
+
 
 TRAJECTORY_ARRAYS: Mapping[str, tuple[type[np.generic], tuple[str, ...]]] = {
     "obs": (np.float32, ("T+1", "n", "O")),

@@ -11,6 +11,7 @@ import zstandard
 from numpy.typing import NDArray
 
 from liir_common import types
+from liir_common.rollout.playable import check_playable
 from liir_common.rpc.gen.liir.v1 import rollout_pb2, tensor_pb2
 from liir_common.types import EnvSpec, Exploration, Ticket, Trajectory, Weights
 
@@ -157,40 +158,3 @@ def decode_trajectory(message: rollout_pb2.Trajectory, spec: EnvSpec) -> Traject
     )
     check_playable(trajectory, spec)
     return trajectory
-
-
-def check_playable(trajectory: Trajectory, spec: EnvSpec) -> None:
-    """Refuse what no episode can produce; it would poison the learner.
-
-    Raises:
-        ValueError: a figure is not finite, an agent has no available action, an action is out of range
-            or not available, or the episode has no end.
-    """
-    if not (trajectory.terminated or trajectory.truncated):
-        raise ValueError("trajectory: wanted terminated or truncated, got neither")
-    for name in ("obs", "state", "log_mu", "reward"):
-        # A sum is finite only if all its terms are, and costs half of asking each of them.
-        with np.errstate(invalid="ignore"):
-            total = getattr(trajectory, name).sum(dtype=np.float64)
-        if not math.isfinite(total):
-            raise ValueError(f"{name}: wanted finite numbers, got NaN or infinity")
-    if not all(map(math.isfinite, trajectory.info.values())):
-        raise ValueError("info: wanted finite numbers, got NaN or infinity")
-    if (trajectory.log_mu > 0).any():
-        raise ValueError("log_mu: wanted logarithms of probabilities, got a positive one")
-    stuck = ~np.logical_or.reduce(trajectory.mask, axis=-1)
-    if stuck.any():
-        raise ValueError(f"mask: {_first(stuck)} has no available action")
-    actions = trajectory.actions
-    bad = (actions < 0) | (actions >= spec.n_actions)
-    if bad.any():
-        raise ValueError(f"actions: wanted 0..{spec.n_actions - 1}, {_first(bad)} has another")
-    steps, agents = np.ogrid[: actions.shape[0], : actions.shape[1]]
-    forbidden = ~trajectory.mask[steps, agents, actions]
-    if forbidden.any():
-        raise ValueError(f"actions: {_first(forbidden)} took an action that its mask forbids")
-
-
-def _first(where: Array) -> str:
-    step, agent = np.argwhere(where)[0]
-    return f"agent {agent} at step {step}"

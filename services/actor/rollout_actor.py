@@ -20,6 +20,7 @@ from liir_common.rollout.play import make_player
 from liir_common.rollout.player import Player
 from liir_common.rpc import carry, channel, codec
 from liir_common.rpc.gen.liir.v1 import rollout_pb2, rollout_pb2_grpc
+from liir_common.rpc.requests import Outgoing, put_together
 from liir_common.rpc.tokens import Role
 
 log = structlog.get_logger()
@@ -79,47 +80,41 @@ class RolloutActor:
 
     def _serve(self, learner: rollout_pb2_grpc.RolloutServiceStub) -> bool:
         """Play over one stream until it ends; true if the run is complete."""
-        outgoing: queue.SimpleQueue[rollout_pb2.PlayRequest | None] = queue.SimpleQueue()
+        outgoing: Outgoing = queue.SimpleQueue()
         name, incarnation = self._hello
         hello = rollout_pb2.Hello(
             actor_id=name, incarnation=incarnation, env_spec_hash=self._player.spec.hash, build=build()
         )
-        outgoing.put(rollout_pb2.PlayRequest(hello=hello))
-        outgoing.put(rollout_pb2.PlayRequest(ready=rollout_pb2.Ready(tickets=self._player.tickets_held)))
+        ready = rollout_pb2.Ready(tickets=self._player.tickets_held)
+        outgoing.put(rollout_pb2.PlayRequest(hello=hello, ready=ready))
         try:
-            return self._answer(learner.Play(iter(outgoing.get, None), wait_for_ready=True), outgoing)
+            return self._answer(learner.Play(put_together(outgoing), wait_for_ready=True), outgoing)
         finally:
             outgoing.put(None)  # ends our side, and the thread in which gRPC reads the queue
 
-    def _answer(
-        self,
-        messages: Iterable[rollout_pb2.PlayResponse],
-        outgoing: queue.SimpleQueue[rollout_pb2.PlayRequest | None],
-    ) -> bool:
+    def _answer(self, messages: Iterable[rollout_pb2.PlayResponse], outgoing: Outgoing) -> bool:
         version, idle_since = -1, time.perf_counter()
         for message in messages:
-            match message.WhichOneof("body"):
-                case "policy":
-                    self._player.load(codec.decode_policy(message.policy, self._shapes))
-                    version = message.policy.version
-                case "ticket":
-                    ticket = codec.decode_ticket(message.ticket)
-                    if ticket.policy_version != version:
-                        raise RuntimeError(f"got a ticket for policy {ticket.policy_version}, have {version}")
-                    begin = time.perf_counter()
-                    trajectory = self._player.play(ticket)
-                    end = time.perf_counter()
-                    stats = rollout_pb2.ActorStats(
-                        play_seconds=end - begin,
-                        wait_seconds=begin - idle_since,
-                        peak_memory_bytes=_peak_memory(),
-                    )
-                    idle_since = end
-                    encoded = codec.encode_trajectory(trajectory, stats, self._compress)
-                    outgoing.put(rollout_pb2.PlayRequest(trajectory=encoded))
-                case "drain":
-                    log.info("drained", reason=message.drain.reason)
-                    return bool(message.drain.run_complete)
+            if message.HasField("policy"):
+                self._player.load(codec.decode_policy(message.policy, self._shapes))
+                version = message.policy.version
+            for ticket in map(codec.decode_ticket, message.tickets):
+                if ticket.policy_version != version:
+                    raise RuntimeError(f"got a ticket for policy {ticket.policy_version}, have {version}")
+                begin = time.perf_counter()
+                trajectory = self._player.play(ticket)
+                end = time.perf_counter()
+                stats = rollout_pb2.ActorStats(
+                    play_seconds=end - begin,
+                    wait_seconds=begin - idle_since,
+                    peak_memory_bytes=_peak_memory(),
+                )
+                idle_since = end
+                encoded = codec.encode_trajectory(trajectory, stats, self._compress)
+                outgoing.put(rollout_pb2.PlayRequest(trajectories=[encoded]))
+            if message.HasField("drain"):
+                log.info("drained", reason=message.drain.reason)
+                return bool(message.drain.run_complete)
         return False
 
 

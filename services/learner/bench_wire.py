@@ -19,6 +19,7 @@ from liir_common.rollout.policy import random_weights
 from liir_common.rpc import codec
 from liir_common.rpc.channel import CHANNEL_OPTIONS
 from liir_common.rpc.gen.liir.v1 import rollout_pb2, rollout_pb2_grpc
+from liir_common.rpc.requests import Outgoing, put_together
 from liir_common.rpc.server import Server
 from liir_common.types import Exploration, Ticket, Trajectory
 from services.learner.intake import Opening
@@ -93,17 +94,15 @@ def _episode(settings: config.Config) -> rollout_pb2.Trajectory:
 def _client(address: str, tree: dict[str, Any]) -> None:
     settings = config.from_tree(tree)
     trajectory = _episode(settings)
-    outgoing: queue.SimpleQueue[rollout_pb2.PlayRequest] = queue.SimpleQueue()
+    tickets = make_player(settings.env, settings.algorithm.policy_hidden).tickets_held
+    outgoing: Outgoing = queue.SimpleQueue()
     hello = rollout_pb2.Hello(
         actor_id=f"bench-{os.getpid()}", env_spec_hash=env_spec(settings.env).hash, build=build()
     )
-    outgoing.put(rollout_pb2.PlayRequest(hello=hello))
-    outgoing.put(rollout_pb2.PlayRequest(ready=rollout_pb2.Ready(tickets=2)))
+    outgoing.put(rollout_pb2.PlayRequest(hello=hello, ready=rollout_pb2.Ready(tickets=tickets)))
     with grpc.insecure_channel(address, options=CHANNEL_OPTIONS) as channel:
-        for message in rollout_pb2_grpc.RolloutServiceStub(channel).Play(iter(outgoing.get, None)):
-            if message.WhichOneof("body") == "ticket":
-                trajectory.episode_id = message.ticket.episode_id
-                trajectory.policy_version = message.ticket.policy_version
-                request = rollout_pb2.PlayRequest()
-                request.trajectory.CopyFrom(trajectory)
-                outgoing.put(request)
+        for message in rollout_pb2_grpc.RolloutServiceStub(channel).Play(put_together(outgoing)):
+            for ticket in message.tickets:
+                trajectory.episode_id = ticket.episode_id
+                trajectory.policy_version = ticket.policy_version
+                outgoing.put(rollout_pb2.PlayRequest(trajectories=[trajectory]))

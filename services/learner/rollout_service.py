@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import time
+from collections import deque
 from collections.abc import AsyncIterator
-from dataclasses import dataclass, field
 
 import grpc
 import structlog
@@ -27,19 +27,68 @@ _MAX_ACTOR_ID = 100
 _EXPIRY_CHECK_S = 1.0
 
 
-@dataclass(eq=False)
 class ActorStream:
-    """One connected actor."""
+    """One connected actor, and what is to be sent to it: what waits goes together, in few messages."""
 
-    actor_id: str
-    outgoing: asyncio.Queue[rollout_pb2.PlayResponse | Exception | None] = field(
-        default_factory=asyncio.Queue
-    )
-    """Messages to send; None ends the stream, an exception ends it with an error."""
-    policy_version: int = -1
-    """The version sent last."""
-    peak_memory: int = 0
-    """Bytes, as the actor says."""
+    def __init__(self, actor_id: str) -> None:
+        self.actor_id = actor_id
+        self.policy_version = -1
+        """The version sent last."""
+        self.peak_memory = 0
+        """Bytes, as the actor says."""
+        self._waiting: deque[rollout_pb2.PlayResponse] = deque()
+        self._woken = asyncio.Event()
+        self._ended = False
+        self._error: Exception | None = None
+
+    def policy(self, policy: rollout_pb2.Policy) -> None:
+        """Send a policy, in front of the tickets that name it."""
+        message = self._last()
+        if message.HasField("policy") or message.tickets:
+            message = self._new()
+        message.policy.CopyFrom(policy)
+        self.policy_version = policy.version
+
+    def ticket(self, ticket: rollout_pb2.Ticket) -> None:
+        """Send a ticket."""
+        self._last().tickets.append(ticket)
+
+    def ack(self, episode_id: int) -> None:
+        """Confirm a trajectory."""
+        self._last().acks.add(episode_id=episode_id)
+
+    def drain(self, drain: rollout_pb2.Drain) -> None:
+        """Send the actor home."""
+        self._last().drain.CopyFrom(drain)
+
+    def end(self, error: Exception | None = None) -> None:
+        """Close the stream once all is sent, with an error if one is given."""
+        self._ended, self._error = True, self._error or error
+        self._woken.set()
+
+    async def responses(self) -> AsyncIterator[rollout_pb2.PlayResponse]:
+        """All that is to be sent, until `end`.
+
+        Raises:
+            Exception: the error that the stream ends with.
+        """
+        while True:
+            while self._waiting:
+                yield self._waiting.popleft()
+            if self._ended:
+                break
+            self._woken.clear()
+            await self._woken.wait()
+        if self._error:
+            raise self._error
+
+    def _last(self) -> rollout_pb2.PlayResponse:
+        return self._waiting[-1] if self._waiting else self._new()
+
+    def _new(self) -> rollout_pb2.PlayResponse:
+        self._waiting.append(rollout_pb2.PlayResponse())
+        self._woken.set()
+        return self._waiting[-1]
 
 
 class RolloutService(rollout_pb2_grpc.RolloutServiceServicer):
@@ -52,7 +101,7 @@ class RolloutService(rollout_pb2_grpc.RolloutServiceServicer):
         self._intake = Intake(
             config.seed, config.algorithm.behaviour, config.training.batch_episodes, first_batch, batches.put
         )
-        self._policies: dict[int, rollout_pb2.PlayResponse] = {}
+        self._policies: dict[int, rollout_pb2.Policy] = {}
         self._streams: set[ActorStream] = set()
         self._drain: rollout_pb2.Drain | None = None
         self._empty = asyncio.Event()
@@ -70,8 +119,7 @@ class RolloutService(rollout_pb2_grpc.RolloutServiceServicer):
 
     def publish(self, opening: Opening, weights: Weights) -> None:
         """Let the actors play a batch."""
-        policy = codec.encode_policy(opening.policy_version, weights)
-        self._policies[opening.policy_version] = rollout_pb2.PlayResponse(policy=policy)
+        self._policies[opening.policy_version] = codec.encode_policy(opening.policy_version, weights)
         oldest_needed = opening.policy_version - self._config.training.lag
         for version in [v for v in self._policies if v < oldest_needed]:
             del self._policies[version]
@@ -82,7 +130,7 @@ class RolloutService(rollout_pb2_grpc.RolloutServiceServicer):
         """Send the actors home and wait until they are gone, or the grace is over."""
         self._drain = rollout_pb2.Drain(reason=reason, run_complete=run_complete)
         for stream in self._streams:
-            stream.outgoing.put_nowait(rollout_pb2.PlayResponse(drain=self._drain))
+            stream.drain(self._drain)
         try:
             await asyncio.wait_for(self._empty.wait(), grace_s)
         except TimeoutError:
@@ -101,22 +149,19 @@ class RolloutService(rollout_pb2_grpc.RolloutServiceServicer):
         self, requests: AsyncIterator[rollout_pb2.PlayRequest], context: grpc.aio.ServicerContext
     ) -> AsyncIterator[rollout_pb2.PlayResponse]:
         """Serve one actor until it leaves."""
-        stream = await self._greet(requests)
-        reader = asyncio.create_task(self._read(requests, stream))
+        first = await anext(requests, None)
+        if first is None or not first.HasField("hello"):
+            raise Refused(grpc.StatusCode.INVALID_ARGUMENT, "the first message of a stream must be hello")
+        stream = self._greet(first.hello)
+        reader = asyncio.create_task(self._read(first, requests, stream))
         try:
-            while (message := await stream.outgoing.get()) is not None:
-                if isinstance(message, Exception):
-                    raise message
-                yield message
+            async for response in stream.responses():
+                yield response
         finally:
             reader.cancel()
             self._leave(stream)
 
-    async def _greet(self, requests: AsyncIterator[rollout_pb2.PlayRequest]) -> ActorStream:
-        first = await anext(requests, None)
-        if first is None or first.WhichOneof("body") != "hello":
-            raise Refused(grpc.StatusCode.INVALID_ARGUMENT, "the first message of a stream must be hello")
-        hello = first.hello
+    def _greet(self, hello: rollout_pb2.Hello) -> ActorStream:
         if len(hello.actor_id) > _MAX_ACTOR_ID:
             raise ValueError(
                 f"actor_id: wanted at most {_MAX_ACTOR_ID} characters, got {len(hello.actor_id)}"
@@ -136,7 +181,7 @@ class RolloutService(rollout_pb2_grpc.RolloutServiceServicer):
         metrics.ACTORS.set(self.actors)
         log.info("actor joined", actor=hello.actor_id, incarnation=hello.incarnation, actors=self.actors)
         if self._drain is not None:
-            stream.outgoing.put_nowait(rollout_pb2.PlayResponse(drain=self._drain))
+            stream.drain(self._drain)
         return stream
 
     def _leave(self, stream: ActorStream) -> None:
@@ -148,47 +193,50 @@ class RolloutService(rollout_pb2_grpc.RolloutServiceServicer):
         log.info("actor left", actor=stream.actor_id, tickets_to_others=reissued, actors=self.actors)
         self._reissued(reissued, "left")
 
-    async def _read(self, requests: AsyncIterator[rollout_pb2.PlayRequest], stream: ActorStream) -> None:
+    async def _read(
+        self,
+        first: rollout_pb2.PlayRequest,
+        requests: AsyncIterator[rollout_pb2.PlayRequest],
+        stream: ActorStream,
+    ) -> None:
         """Handle what the actor sends until it half-closes; whatever ends this ends the stream."""
         try:
+            self._handle(first, stream)
             async for request in requests:
+                if request.HasField("hello"):
+                    raise ValueError("hello: wanted in the first message alone, got another")
                 self._handle(request, stream)
         except (Refused, ValueError) as error:
-            stream.outgoing.put_nowait(error)
+            stream.end(error)
         finally:
-            stream.outgoing.put_nowait(None)
+            stream.end()
 
     def _handle(self, request: rollout_pb2.PlayRequest, stream: ActorStream) -> None:
-        match request.WhichOneof("body"):
-            case "ready":
-                tickets = request.ready.tickets
-                if not 1 <= tickets <= _MAX_READY:
-                    raise ValueError(f"ready: wanted 1..{_MAX_READY} tickets, got {tickets}")
-                self._intake.ask(stream, tickets)
-                self._assign()
-            case "trajectory":
-                self._take(request.trajectory, stream)
-            case body:
-                raise ValueError(f"wanted ready or trajectory, got {body or 'an empty message'}")
+        if request.HasField("ready"):
+            tickets = request.ready.tickets
+            if not 1 <= tickets <= _MAX_READY:
+                raise ValueError(f"ready: wanted 1..{_MAX_READY} tickets, got {tickets}")
+            self._intake.ask(stream, tickets)
+        for trajectory in request.trajectories:
+            self._take(trajectory, stream)
+        self._assign()
 
     def _take(self, message: rollout_pb2.Trajectory, stream: ActorStream) -> None:
-        metrics.RECEIVED_BYTES.inc(message.ByteSize())
         metrics.ACTOR_PLAY_SECONDS.inc(max(0.0, message.stats.play_seconds))
         stream.peak_memory = message.stats.peak_memory_bytes
         metrics.ACTOR_WAIT_SECONDS.inc(max(0.0, message.stats.wait_seconds))
-        if not self._intake.accept(stream, codec.decode_trajectory(message, self._spec)):
+        trajectory = codec.decode_trajectory(message, self._spec)
+        metrics.RECEIVED_BYTES.inc(trajectory.nbytes)
+        if not self._intake.accept(stream, trajectory):
             metrics.DUPLICATES.inc()
-        ack = rollout_pb2.Ack(episode_id=message.episode_id)
-        stream.outgoing.put_nowait(rollout_pb2.PlayResponse(ack=ack))
-        self._assign()
+        stream.ack(message.episode_id)
 
     def _assign(self) -> None:
         for stream, ticket in self._intake.assign(time.monotonic()):
             assert isinstance(stream, ActorStream)
             if stream.policy_version != ticket.policy_version:
-                stream.outgoing.put_nowait(self._policies[ticket.policy_version])
-                stream.policy_version = ticket.policy_version
-            stream.outgoing.put_nowait(rollout_pb2.PlayResponse(ticket=codec.encode_ticket(ticket)))
+                stream.policy(self._policies[ticket.policy_version])
+            stream.ticket(codec.encode_ticket(ticket))
 
     def _reissued(self, tickets: int, reason: str) -> None:
         if tickets:

@@ -7,6 +7,7 @@ import json
 import queue
 import re
 import socket
+from collections import deque
 from collections.abc import Callable, Iterator
 from hashlib import sha256
 from pathlib import Path
@@ -49,6 +50,8 @@ class Actor:
         self._outgoing.put(rollout_pb2.PlayRequest(hello=rollout_pb2.Hello(**fields)))
         stub = rollout_pb2_grpc.RolloutServiceStub(self._channel)
         self._responses = stub.Play(iter(self._outgoing.get, None), timeout=60)
+        self._orders: deque[Ticket] = deque()
+        self._acks: deque[int] = deque()
 
     def __enter__(self) -> Actor:
         return self
@@ -61,20 +64,28 @@ class Actor:
         self._outgoing.put(rollout_pb2.PlayRequest(ready=rollout_pb2.Ready(tickets=tickets)))
 
     def send(self, message: rollout_pb2.Trajectory) -> None:
-        self._outgoing.put(rollout_pb2.PlayRequest(trajectory=message))
+        self._outgoing.put(rollout_pb2.PlayRequest(trajectories=[message]))
 
-    def receive(self, body: str) -> rollout_pb2.PlayResponse:
+    def receive(self) -> rollout_pb2.PlayResponse:
+        """The next message; its policy is loaded, its tickets and acks are kept."""
         response = next(self._responses)
-        assert response.WhichOneof("body") == body, response
+        if response.HasField("policy"):
+            self.player.load(codec.decode_policy(response.policy, policy_shapes(self.player.spec, 64)))
+        self._orders.extend(map(codec.decode_ticket, response.tickets))
+        self._acks.extend(ack.episode_id for ack in response.acks)
         return response
 
     def order(self) -> Ticket:
-        """The next ticket, with the policy loaded that it names."""
-        response = next(self._responses)
-        if response.WhichOneof("body") == "policy":
-            self.player.load(codec.decode_policy(response.policy, policy_shapes(self.player.spec, 64)))
-            response = next(self._responses)
-        return codec.decode_ticket(response.ticket)
+        """The next ticket."""
+        while not self._orders:
+            self.receive()
+        return self._orders.popleft()
+
+    def ack(self) -> int:
+        """The episode that is confirmed next."""
+        while not self._acks:
+            self.receive()
+        return self._acks.popleft()
 
     def play(self, ticket: Ticket) -> rollout_pb2.Trajectory:
         return codec.encode_trajectory(self.player.play(ticket), NO_STATS)
@@ -110,7 +121,7 @@ def play_batches(address: str, batches: int) -> None:
         actor.ask()
         for _ in range(4 * batches):
             actor.send(actor.play(actor.order()))
-            actor.receive("ack")
+            actor.ack()
 
 
 def test_play_stream(learner: tuple[str, Path]) -> None:
@@ -118,19 +129,17 @@ def test_play_stream(learner: tuple[str, Path]) -> None:
     address, _ = learner
     with Actor(address) as actor, TrainingClient(address) as training:
         actor.ask(3)
-        first = actor.receive("policy").policy
-        assert first.version == 0
-        tickets = [codec.decode_ticket(actor.receive("ticket").ticket) for _ in range(3)]
+        assert actor.receive().policy.version == 0
+        tickets = [actor.order() for _ in range(3)]
         assert [ticket.episode_id for ticket in tickets] == [0, 1, 2]
         assert tickets[2].seed == seeds.episode_seed(PLAYER.seed, seeds.TRAINING, 2)
         assert training.status().tickets_outstanding == 3
-        actor.player.load(codec.decode_policy(first, policy_shapes(actor.player.spec, 64)))
         actor.send(actor.play(tickets[0]))
-        assert actor.receive("ack").ack.episode_id == 0
-        tickets.append(codec.decode_ticket(actor.receive("ticket").ticket))
+        assert actor.ack() == 0
+        tickets.append(actor.order())
         for ticket in tickets:
             actor.send(actor.play(ticket))
-            assert actor.receive("ack").ack.episode_id == ticket.episode_id
+            assert actor.ack() == ticket.episode_id
         assert actor.order().policy_version == 1
         assert training.status().learner_step == 1
         assert training.status().episodes == 4

@@ -57,7 +57,7 @@ def act(path: Path, until: int, behaviour: Exploration) -> None:
             while ticket.episode_id < until * BATCH:
                 assert ticket.exploration == behaviour
                 actor.send(actor.play(ticket))
-                actor.receive("ack")
+                actor.ack()
                 ticket = actor.order()
         finally:
             training.stop("test")

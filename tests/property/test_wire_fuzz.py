@@ -7,6 +7,7 @@ from google.protobuf.message import DecodeError
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from liir_common.rollout.playable import check_playable
 from liir_common.rpc import codec
 from liir_common.rpc.gen.liir.v1 import rollout_pb2
 from liir_common.types import policy_shapes
@@ -23,9 +24,10 @@ VALID = {
 def decode(wire: bytes) -> None:
     """Any other error fails the test; gRPC answers the first of these itself, our servicer the second."""
     with suppress(DecodeError, ValueError):
-        codec.check_playable(codec.decode_trajectory(rollout_pb2.Trajectory.FromString(wire), SPEC), SPEC)
+        check_playable(codec.decode_trajectory(rollout_pb2.Trajectory.FromString(wire), SPEC), SPEC)
     with suppress(DecodeError, ValueError):
-        codec.decode_trajectory(rollout_pb2.PlayRequest.FromString(wire).trajectory, SPEC)
+        for trajectory in rollout_pb2.PlayRequest.FromString(wire).trajectories:
+            codec.decode_trajectory(trajectory, SPEC)
 
 
 @given(st.binary(max_size=400))

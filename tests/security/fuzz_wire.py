@@ -28,6 +28,7 @@ from google.protobuf.message import DecodeError, Message
 from liir_common.build import build
 from liir_common.client import TrainingClient
 from liir_common.rollout.play import env_spec
+from liir_common.rollout.playable import check_playable
 from liir_common.rollout.policy import random_weights
 from liir_common.rpc import codec
 from liir_common.rpc.channel import CHANNEL_OPTIONS
@@ -130,7 +131,7 @@ def damaged_trajectory(rng: random.Random, spec: EnvSpec) -> bytes:
 
 
 def decode_trajectory(wire: bytes) -> None:
-    codec.check_playable(codec.decode_trajectory(rollout_pb2.Trajectory.FromString(wire), SPEC), SPEC)
+    check_playable(codec.decode_trajectory(rollout_pb2.Trajectory.FromString(wire), SPEC), SPEC)
 
 
 def decode_policy(wire: bytes) -> None:
@@ -213,7 +214,7 @@ def play_stream(rng: random.Random, spec: EnvSpec) -> list[bytes]:
         return [first, damage_bytes(rng, ready)]
     message = trajectory(spec, compress=rng.random() < 0.5)
     damage_tensor(rng, message)
-    wire = rollout_pb2.PlayRequest(trajectory=message).SerializeToString()
+    wire = rollout_pb2.PlayRequest(trajectories=[message]).SerializeToString()
     return [first, ready, wire if rng.random() < 0.7 else damage_bytes(rng, wire)]
 
 

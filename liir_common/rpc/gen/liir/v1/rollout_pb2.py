@@ -25,35 +25,35 @@ _sym_db = _symbol_database.Default()
 from liir_common.rpc.gen.liir.v1 import tensor_pb2 as liir_dot_v1_dot_tensor__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x15liir/v1/rollout.proto\x12\x07liir.v1\x1a\x14liir/v1/tensor.proto\"\x82\x01\n\x0bPlayRequest\x12\x1f\n\x05hello\x18\x01 \x01(\x0b\x32\x0e.liir.v1.HelloH\x00\x12\x1f\n\x05ready\x18\x02 \x01(\x0b\x32\x0e.liir.v1.ReadyH\x00\x12)\n\ntrajectory\x18\x03 \x01(\x0b\x32\x13.liir.v1.TrajectoryH\x00\x42\x06\n\x04\x62ody\"\x9a\x01\n\x0cPlayResponse\x12!\n\x06policy\x18\x01 \x01(\x0b\x32\x0f.liir.v1.PolicyH\x00\x12!\n\x06ticket\x18\x02 \x01(\x0b\x32\x0f.liir.v1.TicketH\x00\x12\x1b\n\x03\x61\x63k\x18\x03 \x01(\x0b\x32\x0c.liir.v1.AckH\x00\x12\x1f\n\x05\x64rain\x18\x04 \x01(\x0b\x32\x0e.liir.v1.DrainH\x00\x42\x06\n\x04\x62ody\"T\n\x05Hello\x12\x10\n\x08\x61\x63tor_id\x18\x01 \x01(\t\x12\x13\n\x0bincarnation\x18\x02 \x01(\r\x12\x15\n\renv_spec_hash\x18\x03 \x01(\t\x12\r\n\x05\x62uild\x18\x04 \x01(\t\"\x18\n\x05Ready\x12\x0f\n\x07tickets\x18\x01 \x01(\r\"@\n\x06Policy\x12\x0f\n\x07version\x18\x01 \x01(\x04\x12%\n\x07tensors\x18\x02 \x03(\x0b\x32\x14.liir.v1.NamedTensor\"~\n\x06Ticket\x12\x12\n\nepisode_id\x18\x01 \x01(\x04\x12\x16\n\x0epolicy_version\x18\x02 \x01(\x04\x12\x0c\n\x04seed\x18\x03 \x01(\x06\x12)\n\x0b\x65xploration\x18\x04 \x01(\x0e\x32\x14.liir.v1.Exploration\x12\x0f\n\x07\x65psilon\x18\x05 \x01(\x01\"\xf2\x02\n\nTrajectory\x12\x12\n\nepisode_id\x18\x01 \x01(\x04\x12\x16\n\x0epolicy_version\x18\x02 \x01(\x04\x12\x1c\n\x03obs\x18\x03 \x01(\x0b\x32\x0f.liir.v1.Tensor\x12\x1e\n\x05state\x18\x04 \x01(\x0b\x32\x0f.liir.v1.Tensor\x12\x1d\n\x04mask\x18\x05 \x01(\x0b\x32\x0f.liir.v1.Tensor\x12\x1e\n\x05\x61live\x18\x06 \x01(\x0b\x32\x0f.liir.v1.Tensor\x12 \n\x07\x61\x63tions\x18\x07 \x01(\x0b\x32\x0f.liir.v1.Tensor\x12\x1f\n\x06log_mu\x18\x08 \x01(\x0b\x32\x0f.liir.v1.Tensor\x12\x1f\n\x06reward\x18\t \x01(\x0b\x32\x0f.liir.v1.Tensor\x12\x12\n\nterminated\x18\n \x01(\x08\x12\x11\n\ttruncated\x18\x0b \x01(\x08\x12\x0c\n\x04info\x18\x0c \x03(\x01\x12\"\n\x05stats\x18\r \x01(\x0b\x32\x13.liir.v1.ActorStats\"S\n\nActorStats\x12\x14\n\x0cplay_seconds\x18\x01 \x01(\x01\x12\x14\n\x0cwait_seconds\x18\x02 \x01(\x01\x12\x19\n\x11peak_memory_bytes\x18\x03 \x01(\x04\"\x19\n\x03\x41\x63k\x12\x12\n\nepisode_id\x18\x01 \x01(\x04\"-\n\x05\x44rain\x12\x0e\n\x06reason\x18\x01 \x01(\t\x12\x14\n\x0crun_complete\x18\x02 \x01(\x08*\x81\x01\n\x0b\x45xploration\x12\x1b\n\x17\x45XPLORATION_UNSPECIFIED\x10\x00\x12\x1d\n\x19\x45XPLORATION_SOFTMAX_FLOOR\x10\x01\x12\x1e\n\x1a\x45XPLORATION_EPSILON_GREEDY\x10\x02\x12\x16\n\x12\x45XPLORATION_GREEDY\x10\x03\x32I\n\x0eRolloutService\x12\x37\n\x04Play\x12\x14.liir.v1.PlayRequest\x1a\x15.liir.v1.PlayResponse(\x01\x30\x01\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x15liir/v1/rollout.proto\x12\x07liir.v1\x1a\x14liir/v1/tensor.proto\"v\n\x0bPlayRequest\x12\x1d\n\x05hello\x18\x01 \x01(\x0b\x32\x0e.liir.v1.Hello\x12\x1d\n\x05ready\x18\x02 \x01(\x0b\x32\x0e.liir.v1.Ready\x12)\n\x0ctrajectories\x18\x03 \x03(\x0b\x32\x13.liir.v1.Trajectory\"\x8c\x01\n\x0cPlayResponse\x12\x1f\n\x06policy\x18\x01 \x01(\x0b\x32\x0f.liir.v1.Policy\x12 \n\x07tickets\x18\x02 \x03(\x0b\x32\x0f.liir.v1.Ticket\x12\x1a\n\x04\x61\x63ks\x18\x03 \x03(\x0b\x32\x0c.liir.v1.Ack\x12\x1d\n\x05\x64rain\x18\x04 \x01(\x0b\x32\x0e.liir.v1.Drain\"T\n\x05Hello\x12\x10\n\x08\x61\x63tor_id\x18\x01 \x01(\t\x12\x13\n\x0bincarnation\x18\x02 \x01(\r\x12\x15\n\renv_spec_hash\x18\x03 \x01(\t\x12\r\n\x05\x62uild\x18\x04 \x01(\t\"\x18\n\x05Ready\x12\x0f\n\x07tickets\x18\x01 \x01(\r\"@\n\x06Policy\x12\x0f\n\x07version\x18\x01 \x01(\x04\x12%\n\x07tensors\x18\x02 \x03(\x0b\x32\x14.liir.v1.NamedTensor\"~\n\x06Ticket\x12\x12\n\nepisode_id\x18\x01 \x01(\x04\x12\x16\n\x0epolicy_version\x18\x02 \x01(\x04\x12\x0c\n\x04seed\x18\x03 \x01(\x06\x12)\n\x0b\x65xploration\x18\x04 \x01(\x0e\x32\x14.liir.v1.Exploration\x12\x0f\n\x07\x65psilon\x18\x05 \x01(\x01\"\xf2\x02\n\nTrajectory\x12\x12\n\nepisode_id\x18\x01 \x01(\x04\x12\x16\n\x0epolicy_version\x18\x02 \x01(\x04\x12\x1c\n\x03obs\x18\x03 \x01(\x0b\x32\x0f.liir.v1.Tensor\x12\x1e\n\x05state\x18\x04 \x01(\x0b\x32\x0f.liir.v1.Tensor\x12\x1d\n\x04mask\x18\x05 \x01(\x0b\x32\x0f.liir.v1.Tensor\x12\x1e\n\x05\x61live\x18\x06 \x01(\x0b\x32\x0f.liir.v1.Tensor\x12 \n\x07\x61\x63tions\x18\x07 \x01(\x0b\x32\x0f.liir.v1.Tensor\x12\x1f\n\x06log_mu\x18\x08 \x01(\x0b\x32\x0f.liir.v1.Tensor\x12\x1f\n\x06reward\x18\t \x01(\x0b\x32\x0f.liir.v1.Tensor\x12\x12\n\nterminated\x18\n \x01(\x08\x12\x11\n\ttruncated\x18\x0b \x01(\x08\x12\x0c\n\x04info\x18\x0c \x03(\x01\x12\"\n\x05stats\x18\r \x01(\x0b\x32\x13.liir.v1.ActorStats\"S\n\nActorStats\x12\x14\n\x0cplay_seconds\x18\x01 \x01(\x01\x12\x14\n\x0cwait_seconds\x18\x02 \x01(\x01\x12\x19\n\x11peak_memory_bytes\x18\x03 \x01(\x04\"\x19\n\x03\x41\x63k\x12\x12\n\nepisode_id\x18\x01 \x01(\x04\"-\n\x05\x44rain\x12\x0e\n\x06reason\x18\x01 \x01(\t\x12\x14\n\x0crun_complete\x18\x02 \x01(\x08*\x81\x01\n\x0b\x45xploration\x12\x1b\n\x17\x45XPLORATION_UNSPECIFIED\x10\x00\x12\x1d\n\x19\x45XPLORATION_SOFTMAX_FLOOR\x10\x01\x12\x1e\n\x1a\x45XPLORATION_EPSILON_GREEDY\x10\x02\x12\x16\n\x12\x45XPLORATION_GREEDY\x10\x03\x32I\n\x0eRolloutService\x12\x37\n\x04Play\x12\x14.liir.v1.PlayRequest\x1a\x15.liir.v1.PlayResponse(\x01\x30\x01\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'liir.v1.rollout_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_EXPLORATION']._serialized_start=1185
-  _globals['_EXPLORATION']._serialized_end=1314
-  _globals['_PLAYREQUEST']._serialized_start=57
-  _globals['_PLAYREQUEST']._serialized_end=187
-  _globals['_PLAYRESPONSE']._serialized_start=190
-  _globals['_PLAYRESPONSE']._serialized_end=344
-  _globals['_HELLO']._serialized_start=346
-  _globals['_HELLO']._serialized_end=430
-  _globals['_READY']._serialized_start=432
-  _globals['_READY']._serialized_end=456
-  _globals['_POLICY']._serialized_start=458
-  _globals['_POLICY']._serialized_end=522
-  _globals['_TICKET']._serialized_start=524
-  _globals['_TICKET']._serialized_end=650
-  _globals['_TRAJECTORY']._serialized_start=653
-  _globals['_TRAJECTORY']._serialized_end=1023
-  _globals['_ACTORSTATS']._serialized_start=1025
-  _globals['_ACTORSTATS']._serialized_end=1108
-  _globals['_ACK']._serialized_start=1110
-  _globals['_ACK']._serialized_end=1135
-  _globals['_DRAIN']._serialized_start=1137
-  _globals['_DRAIN']._serialized_end=1182
-  _globals['_ROLLOUTSERVICE']._serialized_start=1316
-  _globals['_ROLLOUTSERVICE']._serialized_end=1389
+  _globals['_EXPLORATION']._serialized_start=1158
+  _globals['_EXPLORATION']._serialized_end=1287
+  _globals['_PLAYREQUEST']._serialized_start=56
+  _globals['_PLAYREQUEST']._serialized_end=174
+  _globals['_PLAYRESPONSE']._serialized_start=177
+  _globals['_PLAYRESPONSE']._serialized_end=317
+  _globals['_HELLO']._serialized_start=319
+  _globals['_HELLO']._serialized_end=403
+  _globals['_READY']._serialized_start=405
+  _globals['_READY']._serialized_end=429
+  _globals['_POLICY']._serialized_start=431
+  _globals['_POLICY']._serialized_end=495
+  _globals['_TICKET']._serialized_start=497
+  _globals['_TICKET']._serialized_end=623
+  _globals['_TRAJECTORY']._serialized_start=626
+  _globals['_TRAJECTORY']._serialized_end=996
+  _globals['_ACTORSTATS']._serialized_start=998
+  _globals['_ACTORSTATS']._serialized_end=1081
+  _globals['_ACK']._serialized_start=1083
+  _globals['_ACK']._serialized_end=1108
+  _globals['_DRAIN']._serialized_start=1110
+  _globals['_DRAIN']._serialized_end=1155
+  _globals['_ROLLOUTSERVICE']._serialized_start=1289
+  _globals['_ROLLOUTSERVICE']._serialized_end=1362
 # @@protoc_insertion_point(module_scope)

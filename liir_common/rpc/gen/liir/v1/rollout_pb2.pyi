@@ -20,26 +20,26 @@ EXPLORATION_EPSILON_GREEDY: Exploration
 EXPLORATION_GREEDY: Exploration
 
 class PlayRequest(_message.Message):
-    __slots__ = ("hello", "ready", "trajectory")
+    __slots__ = ("hello", "ready", "trajectories")
     HELLO_FIELD_NUMBER: _ClassVar[int]
     READY_FIELD_NUMBER: _ClassVar[int]
-    TRAJECTORY_FIELD_NUMBER: _ClassVar[int]
+    TRAJECTORIES_FIELD_NUMBER: _ClassVar[int]
     hello: Hello
     ready: Ready
-    trajectory: Trajectory
-    def __init__(self, hello: _Optional[_Union[Hello, _Mapping]] = ..., ready: _Optional[_Union[Ready, _Mapping]] = ..., trajectory: _Optional[_Union[Trajectory, _Mapping]] = ...) -> None: ...
+    trajectories: _containers.RepeatedCompositeFieldContainer[Trajectory]
+    def __init__(self, hello: _Optional[_Union[Hello, _Mapping]] = ..., ready: _Optional[_Union[Ready, _Mapping]] = ..., trajectories: _Optional[_Iterable[_Union[Trajectory, _Mapping]]] = ...) -> None: ...
 
 class PlayResponse(_message.Message):
-    __slots__ = ("policy", "ticket", "ack", "drain")
+    __slots__ = ("policy", "tickets", "acks", "drain")
     POLICY_FIELD_NUMBER: _ClassVar[int]
-    TICKET_FIELD_NUMBER: _ClassVar[int]
-    ACK_FIELD_NUMBER: _ClassVar[int]
+    TICKETS_FIELD_NUMBER: _ClassVar[int]
+    ACKS_FIELD_NUMBER: _ClassVar[int]
     DRAIN_FIELD_NUMBER: _ClassVar[int]
     policy: Policy
-    ticket: Ticket
-    ack: Ack
+    tickets: _containers.RepeatedCompositeFieldContainer[Ticket]
+    acks: _containers.RepeatedCompositeFieldContainer[Ack]
     drain: Drain
-    def __init__(self, policy: _Optional[_Union[Policy, _Mapping]] = ..., ticket: _Optional[_Union[Ticket, _Mapping]] = ..., ack: _Optional[_Union[Ack, _Mapping]] = ..., drain: _Optional[_Union[Drain, _Mapping]] = ...) -> None: ...
+    def __init__(self, policy: _Optional[_Union[Policy, _Mapping]] = ..., tickets: _Optional[_Iterable[_Union[Ticket, _Mapping]]] = ..., acks: _Optional[_Iterable[_Union[Ack, _Mapping]]] = ..., drain: _Optional[_Union[Drain, _Mapping]] = ...) -> None: ...
 
 class Hello(_message.Message):
     __slots__ = ("actor_id", "incarnation", "env_spec_hash", "build")

@@ -49,7 +49,8 @@ class RolloutServiceServicer:
     def Play(self, request_iterator, context):
         """One stream per actor. The actor says hello, then how many tickets it wants to hold at a time; the
         learner answers with the policy of each version once, tickets, and an ack per trajectory, which makes
-        room for the next ticket. Tickets not played when the stream ends go to another actor.
+        room for the next ticket. Tickets not played when the stream ends go to another actor. Either side puts
+        what waits to be sent into one message, for a message costs more than what is in it.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

@@ -513,6 +513,26 @@ def bench_wire_command(
     _print_result(bench_wire(map_name, streams), as_json)
 
 
+@bench.command("policy")
+def bench_policy_command(
+    map_name: Map = "3m", streams: Annotated[int, typer.Option(min=1)] = 32, as_json: Json = False
+) -> None:
+    """How soon a new policy is with all actors."""
+    bench_policy = importlib.import_module("services.learner.bench_wire").bench_policy
+    _print_result(bench_policy(map_name, streams), as_json)
+
+
+@bench.command("beside")
+def bench_beside_command(
+    map_name: Map = "3m",
+    rate: Annotated[float, typer.Option(min=1, help="Episodes per second.")] = 300.0,
+    as_json: Json = False,
+) -> None:
+    """What learner steps lose to episodes that come in meanwhile."""
+    bench_beside = importlib.import_module("services.learner.bench_wire").bench_beside
+    _print_result(bench_beside(map_name, rate), as_json)
+
+
 @bench.command("train")
 def bench_train_command(
     map_name: Map = "3m",

@@ -1,4 +1,4 @@
-"""How many episodes a second the learner takes in, and what each costs its process."""
+"""The learner's end of the actors' streams: what an episode costs its process, when a policy is with all."""
 
 from __future__ import annotations
 
@@ -6,11 +6,16 @@ import asyncio
 import multiprocessing
 import os
 import queue
+import threading
 import time
+from collections.abc import AsyncIterator, MutableSequence
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
 from statistics import median
 from typing import Any
 
 import grpc
+import torch
 
 from liir_common import config
 from liir_common.build import build
@@ -21,67 +26,182 @@ from liir_common.rpc.channel import CHANNEL_OPTIONS
 from liir_common.rpc.gen.liir.v1 import rollout_pb2, rollout_pb2_grpc
 from liir_common.rpc.requests import Outgoing, put_together
 from liir_common.rpc.server import Server
-from liir_common.types import Exploration, Ticket, Trajectory
+from liir_common.types import Exploration, Ticket, Trajectory, Weights
+from services.learner.algorithms import make_algorithm
+from services.learner.algorithms.runtime import set_up_process
+from services.learner.bench import synthetic_batch
 from services.learner.intake import Opening
 from services.learner.rollout_service import RolloutService
 
 _AHEAD = 8
-"""Batches open at a time, so that no stream ever waits for the learner step that this leaves out."""
+"""Batches open at a time, so that no stream ever waits for the learner step that is left out."""
 
 
-def bench_wire(map_name: str, streams: int = 4, batches: int = 40, repeats: int = 5) -> dict[str, Any]:
-    """Medians over `repeats` of the rate and of this process's CPU time per episode.
+@dataclass
+class _Intake:
+    """A learner that neither learns nor plays: batches are opened and come back."""
 
-    The clients are processes of their own, each with one stream, that answer every ticket with the same
-    real episode: all that is left out is playing and learning.
-    """
-    settings = config.load(None, [f"env.map={map_name}", f"training.lag={1}"])
-    return asyncio.run(_measure(settings, streams, batches, repeats))
+    service: RolloutService
+    delivered: queue.SimpleQueue[list[Trajectory] | None]
+    weights: Weights
+    arrivals: MutableSequence[float]
+    """Per stream, when it got the newest policy, on the monotonic clock of all processes"""
+    opened: int = 0
+
+    def open(self, policy_version: int = 0) -> None:
+        """Let the streams answer one more batch."""
+        self.service.publish(Opening(self.opened, policy_version, 0.1), self.weights)
+        self.opened += 1
+
+    async def next_batch(self) -> None:
+        """Wait until the oldest open batch has come in."""
+        await asyncio.to_thread(self.delivered.get)
 
 
-async def _measure(settings: config.Config, streams: int, batches: int, repeats: int) -> dict[str, Any]:
+@asynccontextmanager
+async def _intake(settings: config.Config, streams: int, tickets: int) -> AsyncIterator[_Intake]:
+    """Clients are processes of their own, each with one stream that holds `tickets`, and answer every ticket
+    with the same real episode."""
     spec = env_spec(settings.env)
     delivered: queue.SimpleQueue[list[Trajectory] | None] = queue.SimpleQueue()
     service = RolloutService(settings, spec, 0, delivered)
     server = Server("127.0.0.1", 0, settings.security)
     rollout_pb2_grpc.add_RolloutServiceServicer_to_server(service, server.grpc)
     await server.start()
-    weights = random_weights(spec, settings.algorithm.policy_hidden, seed=0)
-    for batch in range(_AHEAD):
-        service.publish(Opening(batch, 0, 0.1), weights)
     spawn = multiprocessing.get_context("spawn")
+    arrivals: Any = spawn.Array("d", streams, lock=False)
+    address = f"127.0.0.1:{server.port}"
     clients = [
-        spawn.Process(target=_client, args=(f"127.0.0.1:{server.port}", settings.tree()), daemon=True)
-        for _ in range(streams)
+        spawn.Process(target=_client, args=(address, settings.tree(), tickets, arrivals, i), daemon=True)
+        for i in range(streams)
     ]
     for client in clients:
         client.start()
-    opened, rates, costs = _AHEAD, [], []
-    per_batch = settings.training.batch_episodes
-    for repeat in range(repeats + 1):
-        begin, cpu = time.perf_counter(), time.process_time()
-        for _ in range(batches):
-            await asyncio.to_thread(delivered.get)
-            service.publish(Opening(opened, 0, 0.1), weights)
-            opened += 1
-        if repeat:  # the first is the warm-up
-            episodes = batches * per_batch
-            rates.append(episodes / (time.perf_counter() - begin))
-            costs.append((time.process_time() - cpu) / episodes)
-    for client in clients:
-        client.terminate()
-    await server.stop(0)
+    try:
+        while service.actors < streams:
+            await asyncio.sleep(0.1)
+        weights = random_weights(spec, settings.algorithm.policy_hidden, seed=0)
+        yield _Intake(service, delivered, weights, arrivals)
+    finally:
+        for client in clients:
+            client.terminate()
+        await server.stop(0)
+
+
+def bench_wire(map_name: str, streams: int = 4, batches: int = 40, repeats: int = 5) -> dict[str, Any]:
+    """Medians over `repeats` of the rate and of this process's CPU time per episode, as fast as they come."""
+    settings = config.load(None, [f"env.map={map_name}", "training.lag=1"])
+    per_repeat = batches * settings.training.batch_episodes
+
+    async def measure() -> tuple[list[float], list[float]]:
+        rates, costs = [], []
+        async with _intake(settings, streams, _tickets(settings)) as intake:
+            for _ in range(_AHEAD):
+                intake.open()
+            for repeat in range(repeats + 1):
+                begin, cpu = time.perf_counter(), time.process_time()
+                for _ in range(batches):
+                    await intake.next_batch()
+                    intake.open()
+                if repeat:  # the first is the warm-up
+                    rates.append(per_repeat / (time.perf_counter() - begin))
+                    costs.append((time.process_time() - cpu) / per_repeat)
+        return rates, costs
+
+    rates, costs = asyncio.run(measure())
     size = _episode(settings).ByteSize()
     return {
-        "map": settings.env.map,
+        "map": map_name,
         "streams": streams,
         "bytes_per_episode": size,
         "episodes_per_s": median(rates),
         "megabytes_per_s": median(rates) * size / 1e6,
         "learner_cpu_us_per_episode": 1e6 * median(costs),
-        "episodes": batches * per_batch,
+        "episodes": per_repeat,
         "repeats": repeats,
     }
+
+
+def bench_policy(map_name: str, streams: int = 32, repeats: int = 100) -> dict[str, Any]:
+    """Median time from publishing a policy until the last of `streams` actors has it."""
+    settings = config.load(None, [f"env.map={map_name}", f"training.batch_episodes={streams}"])
+
+    async def measure() -> tuple[list[float], int]:
+        latencies = []
+        async with _intake(settings, streams, tickets=1) as intake:
+            for version in range(repeats + 1):
+                begin = time.monotonic()
+                intake.open(version)
+                await intake.next_batch()
+                assert min(intake.arrivals) >= begin  # a ticket for each
+                if version:  # the first is the warm-up
+                    latencies.append(max(intake.arrivals) - begin)
+            return latencies, codec.encode_policy(0, intake.weights).ByteSize()
+
+    latencies, size = asyncio.run(measure())
+    return {
+        "map": map_name,
+        "streams": streams,
+        "bytes_per_policy": size,
+        "policy_ms": 1e3 * median(latencies),
+        "slowest_ms": 1e3 * max(latencies),
+        "repeats": repeats,
+    }
+
+
+def bench_beside(
+    map_name: str, rate: float = 300.0, streams: int = 4, seconds: float = 20.0
+) -> dict[str, Any]:
+    """What learner steps of one thread lose while the same process takes in `rate` episodes per second."""
+    settings = config.load(None, [f"env.map={map_name}", "training.lag=1"])
+    set_up_process(1)
+    spec = env_spec(settings.env)
+    learner = make_algorithm(spec, settings.algorithm, 0, torch.device("cpu"))
+    batch = synthetic_batch(spec, settings.training.batch_episodes, 25, seed=0)
+    period = settings.training.batch_episodes / rate
+
+    def learn(stop: threading.Event, steps: list[float]) -> None:
+        set_up_process(1)  # threads are counted for each thread that asks
+        while not stop.is_set():
+            begin = time.perf_counter()
+            learner.update(batch)
+            steps.append(time.perf_counter() - begin)
+
+    async def measure(intake: _Intake, busy: bool) -> float:
+        stop, steps = threading.Event(), list[float]()
+        thread = threading.Thread(target=learn, args=(stop, steps))
+        thread.start()
+        begin = time.perf_counter()
+        while time.perf_counter() - begin < seconds:
+            next_open = time.perf_counter() + period
+            if busy:
+                intake.open()
+                await intake.next_batch()
+            await asyncio.sleep(max(0.0, next_open - time.perf_counter()))
+        stop.set()
+        await asyncio.to_thread(thread.join)
+        return median(steps[1:])
+
+    async def compare() -> tuple[list[float], list[float]]:
+        alone, beside = [], []
+        async with _intake(settings, streams, _tickets(settings)) as intake:
+            for _ in range(3):  # in turns, for a machine that others use
+                alone.append(await measure(intake, busy=False))
+                beside.append(await measure(intake, busy=True))
+        return alone, beside
+
+    alone, beside = asyncio.run(compare())
+    return {
+        "map": map_name,
+        "episodes_per_s": rate,
+        "update_alone_ms": 1e3 * median(alone),
+        "update_beside_ms": 1e3 * median(beside),
+        "loss": median(b / a for a, b in zip(alone, beside, strict=True)) - 1,
+    }
+
+
+def _tickets(settings: config.Config) -> int:
+    return make_player(settings.env, settings.algorithm.policy_hidden).tickets_held
 
 
 def _episode(settings: config.Config) -> rollout_pb2.Trajectory:
@@ -91,10 +211,11 @@ def _episode(settings: config.Config) -> rollout_pb2.Trajectory:
     return codec.encode_trajectory(trajectory, rollout_pb2.ActorStats())
 
 
-def _client(address: str, tree: dict[str, Any]) -> None:
+def _client(
+    address: str, tree: dict[str, Any], tickets: int, arrivals: MutableSequence[float], index: int
+) -> None:
     settings = config.from_tree(tree)
     trajectory = _episode(settings)
-    tickets = make_player(settings.env, settings.algorithm.policy_hidden).tickets_held
     outgoing: Outgoing = queue.SimpleQueue()
     hello = rollout_pb2.Hello(
         actor_id=f"bench-{os.getpid()}", env_spec_hash=env_spec(settings.env).hash, build=build()
@@ -102,6 +223,8 @@ def _client(address: str, tree: dict[str, Any]) -> None:
     outgoing.put(rollout_pb2.PlayRequest(hello=hello, ready=rollout_pb2.Ready(tickets=tickets)))
     with grpc.insecure_channel(address, options=CHANNEL_OPTIONS) as channel:
         for message in rollout_pb2_grpc.RolloutServiceStub(channel).Play(put_together(outgoing)):
+            if message.HasField("policy"):
+                arrivals[index] = time.monotonic()
             for ticket in message.tickets:
                 trajectory.episode_id = ticket.episode_id
                 trajectory.policy_version = ticket.policy_version

@@ -1,0 +1,3 @@
+from liir_common.cli import main
+
+main()

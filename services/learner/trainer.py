@@ -92,7 +92,10 @@ class Trainer:
     @property
     def complete(self) -> bool:
         """Whether the run has all its environment steps."""
-        return self.progress.counters.env_steps >= self.config.training.total_env_steps
+        return self._completes(self.progress.counters)
+
+    def _completes(self, counters: Counters) -> bool:
+        return counters.env_steps >= self.config.training.total_env_steps
 
     @property
     def next_batch(self) -> int:
@@ -129,12 +132,14 @@ class Trainer:
         opening, _ = self._openings.popleft()
         with _timed("update") as update:
             batch = Batch.from_trajectories(trajectories, opening.epsilon)
-            figures = self.algorithm.update(batch)
-        before = progress.counters
-        progress.counters = Counters(
-            before.learner_step + 1, before.env_steps + batch.env_steps, before.episodes + len(trajectories)
-        )
-        self._open(before.learner_step + 1 + self.config.training.lag)
+            before = progress.counters
+            after = Counters(
+                before.learner_step + 1,
+                before.env_steps + batch.env_steps,
+                before.episodes + len(trajectories),
+            )
+            figures = self.algorithm.update(batch, partial(self._open, after))
+        progress.counters = after
         with _timed("record"):
             seconds = {"collect_s": collect.seconds, "update_s": update.seconds}
             self._record(opening, trajectories, figures | seconds)
@@ -143,17 +148,18 @@ class Trainer:
                 self._save()
         return True
 
-    def _open(self, batch: int) -> None:
-        """Let the actors play `batch` with the newest policy, unless the run is complete.
+    def _open(self, counters: Counters) -> None:
+        """Let the actors play a batch with the policy of the step that ends at `counters`.
 
-        Even then the opening is kept, so that a run resumed with more steps goes on as if never ended.
+        If the run is complete then, the opening is kept only, so that a run resumed with more steps goes on
+        as if never ended.
         """
-        counters = self.progress.counters
         epsilon = self.config.algorithm.exploration.epsilon(counters.env_steps)
+        batch = counters.learner_step + self.config.training.lag
         opening = Opening(batch, counters.learner_step, epsilon)
         weights = self.algorithm.policy()
         self._openings.append((opening, weights))
-        if not self.complete:
+        if not self._completes(counters):
             self._publish(opening, weights)
 
     def _record(self, opening: Opening, trajectories: list[Trajectory], figures: Mapping[str, float]) -> None:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 
 from liir_common.config import METHOD_PRESETS, PRESETS, AlgorithmConfig
 from liir_common.types import Batch, EnvSpec, policy_shapes
@@ -59,6 +60,19 @@ def assert_equal_states(a: Algorithm, b: Algorithm, *, but_for: str = "nothing")
     x, y = ({k: v for k, v in s.items() if not k.startswith(but_for)} for s in (a.state(), b.state()))
     assert x.keys() == y.keys()
     assert [name for name in x if not torch.equal(x[name], y[name])] == []
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_policy_is_announced_once_and_stays_as_it_was_then(method: str) -> None:
+    algorithm = make(method)
+    announced: list[dict[str, NDArray[np.float32]]] = []
+    for seed in range(3):
+        before = algorithm.policy()
+        algorithm.update(batch_of(seed), lambda: announced.append(algorithm.policy()))
+        after = algorithm.policy()
+        assert len(announced) == seed + 1
+        assert [name for name in after if not np.array_equal(announced[-1][name], after[name])] == []
+    assert any(not np.array_equal(before[name], after[name]) for name in after)
 
 
 @pytest.mark.parametrize("method", METHODS)

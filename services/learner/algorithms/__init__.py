@@ -33,8 +33,11 @@ class Algorithm(Protocol):
     def intrinsic(self) -> dict[str, NDArray[np.float32]]:
         """Copies of the weights of the intrinsic reward; empty if the method has none."""
 
-    def update(self, batch: Batch) -> dict[str, float]:
+    def update(self, batch: Batch, policy_ready: Callable[[], None] = lambda: None) -> dict[str, float]:
         """One learner step; returns figures by name, those without a value in this batch left out.
+
+        `policy_ready` is called once, as soon as `policy()` is what this step leaves: the next batch can be
+        played with it while the rest of the step is made.
 
         Raises:
             ValueError: the batch does not fit; nothing has changed then.

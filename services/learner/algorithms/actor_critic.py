@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import torch
@@ -75,6 +75,18 @@ class ActorCritic:
     def _prepare(self, batch: Batch) -> Data:
         limit = self._config.limit_is_terminal
         return prepare(batch, self._spec, limit_is_terminal=limit, device=self._device, dtype=self._dtype)
+
+    def _announce(self, policy_ready: Callable[[], None]) -> None:
+        """Say that the policy is what the step leaves; what follows, the fits of critics, does not touch it.
+
+        Raises:
+            FloatingPointError: nobody could play with it.
+        """
+        if not torch.isfinite(self._policy.theta).all():
+            raise FloatingPointError(
+                "learning has diverged: the policy is not finite; lower the learning rates"
+            )
+        policy_ready()
 
     def _return(self, data: Data, reward: Tensor, value: Tensor) -> Tensor:
         """TD(λ_g) returns [B, T, k] of `reward` [B, T, k] over `value` [B, T+1, k]."""

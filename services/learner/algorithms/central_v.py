@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 
 from liir_common.config import AlgorithmConfig
@@ -20,8 +22,8 @@ class CentralV(ActorCritic):
         width = fit_width(coma_critic_size(spec), lambda width: count(StateValue(spec, width).shapes))
         super().__init__(spec, config, seed, device, dtype, StateValue(spec, width))
 
-    def update(self, batch: Batch) -> dict[str, float]:
-        """One learner step on `batch`; returns its figures.
+    def update(self, batch: Batch, policy_ready: Callable[[], None] = lambda: None) -> dict[str, float]:
+        """One learner step on `batch`; returns its figures. `policy_ready` is as in `Algorithm`.
 
         Raises:
             ValueError: the batch does not fit (see `check`); nothing has changed then.
@@ -31,4 +33,5 @@ class CentralV(ActorCritic):
         value, target = self._varphi.values(data, data.state)
         returns = self._return(data, data.reward, target)
         _, _, metrics = self._policy.advance(data, self._advantage(data, returns, value))
+        self._announce(policy_ready)
         return to_floats(metrics | self._varphi.fit(data, data.state, returns, "value"))

@@ -6,6 +6,8 @@ worth beyond the agent's own average over actions is its advantage: a credit for
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 from torch.nn import functional
@@ -27,8 +29,8 @@ class Coma(ActorCritic):
     ) -> None:
         super().__init__(spec, config, seed, device, dtype, CounterfactualValue(spec))
 
-    def update(self, batch: Batch) -> dict[str, float]:
-        """One learner step on `batch`; returns its figures.
+    def update(self, batch: Batch, policy_ready: Callable[[], None] = lambda: None) -> dict[str, float]:
+        """One learner step on `batch`; returns its figures. `policy_ready` is as in `Algorithm`.
 
         Raises:
             ValueError: the batch does not fit (see `check`); nothing has changed then.
@@ -46,6 +48,7 @@ class Coma(ActorCritic):
         if self._config.normalize_advantages:
             advantage = normalize(advantage, data.weight)
         _, _, metrics = self._policy.advance(data, advantage)
+        self._announce(policy_ready)
         fitted = self._varphi.regress(lambda q: _pick(q, taken), inputs, returns[data.filled.bool()], "value")
         return to_floats(metrics | fitted)
 

@@ -6,6 +6,8 @@ each of them the others are a part of the environment.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 
 from liir_common.config import AlgorithmConfig
@@ -25,8 +27,8 @@ class Iac(ActorCritic):
         width = fit_width(coma_critic_size(spec), lambda width: count(LocalValue(spec, width).shapes))
         super().__init__(spec, config, seed, device, dtype, LocalValue(spec, width))
 
-    def update(self, batch: Batch) -> dict[str, float]:
-        """One learner step on `batch`; returns its figures.
+    def update(self, batch: Batch, policy_ready: Callable[[], None] = lambda: None) -> dict[str, float]:
+        """One learner step on `batch`; returns its figures. `policy_ready` is as in `Algorithm`.
 
         The team's reward goes on after an agent's death, and so do its returns: the dead see zeros.
 
@@ -39,4 +41,5 @@ class Iac(ActorCritic):
         value, target = self._varphi.values(data, obs)
         returns = self._return(data, data.reward, target)
         _, _, metrics = self._policy.advance(data, self._advantage(data, returns, value))
+        self._announce(policy_ready)
         return to_floats(metrics | self._varphi.fit(data, obs, returns, "value"))

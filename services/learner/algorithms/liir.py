@@ -12,7 +12,7 @@ through r_in, exact for every form of advantage.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -82,8 +82,8 @@ class Liir(ActorCritic):
         self._learns_reward = config.lambda_ > 0 and not config.freeze_eta
         self._pending: Inner | None = None
 
-    def update(self, batch: Batch) -> dict[str, float]:
-        """One iteration of Algorithm 1 on `batch`; returns its figures.
+    def update(self, batch: Batch, policy_ready: Callable[[], None] = lambda: None) -> dict[str, float]:
+        """One iteration of Algorithm 1 on `batch`; returns its figures. `policy_ready` is as in `Algorithm`.
 
         Step 5 of the algorithm judges θ' on the samples that made it or, one batch later, on fresh ones.
 
@@ -100,6 +100,7 @@ class Liir(ActorCritic):
         if self._pending:
             metrics |= self._improve_reward(self._pending, data, a_ex)
         inner, proxy_return, figures = self._improve_policy(batch, data)
+        self._announce(policy_ready)
         metrics |= figures
         if self._learns_reward and self._config.outer_samples == "fresh":
             self._pending = inner

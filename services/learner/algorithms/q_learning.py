@@ -8,7 +8,7 @@ that actors and evaluators play it as they play a policy.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Protocol, TypeVar
 
@@ -107,10 +107,11 @@ class QLearning:
         """
         restore(self._tensors(), state)
 
-    def update(self, batch: Batch) -> dict[str, float]:
+    def update(self, batch: Batch, policy_ready: Callable[[], None] = lambda: None) -> dict[str, float]:
         """One learner step: keep `batch` and learn from the replay, as often as the episodes so far allow.
 
         The figures are those of the last update on a sample; there is none until the replay holds enough.
+        `policy_ready` is as in `Algorithm`.
 
         Raises:
             ValueError: the batch does not fit (see `check`); nothing has changed then.
@@ -127,7 +128,9 @@ class QLearning:
         self._steps += 1
         if self._config.target_interval and int(self._steps) % self._config.target_interval == 0:
             self._target.copy_(self._parameters)
-        return to_floats(metrics) if metrics else {}
+        figures = to_floats(metrics) if metrics else {}
+        policy_ready()
+        return figures
 
     def _sample(self) -> Sample:
         random = np.random.default_rng([int(self._seed), int(self._updates)])

@@ -223,8 +223,8 @@ class LearnerConfig(Section):
     """0 takes a free one; the run directory's endpoints.json says which."""
     metrics_port: int = Field(9101, ge=0, le=65535)
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    threads: int = Field(2, ge=1)
-    """Threads of one matrix product."""
+    threads: int = Field(1, ge=1)
+    """Of a learner step; actors play beside most of it, so more pay only where cores are idle then."""
     insecure: bool = False
     """Serve plaintext on an address that is not loopback."""
 

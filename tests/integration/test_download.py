@@ -7,6 +7,7 @@ import os
 import re
 import socket
 import threading
+import time
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, replace
@@ -106,6 +107,9 @@ def store(tmp_path: Path) -> Store:
     return Store(tmp_path / "run")
 
 
+_TIME_TO_READ_S = 0.5
+
+
 @contextmanager
 def cutting(address: str, limit: int, connections: int) -> Iterator[str]:
     """A way to `address` that hangs up after `limit` bytes of answers, and for good after `connections`."""
@@ -134,15 +138,23 @@ def cutting(address: str, limit: int, connections: int) -> Iterator[str]:
 
 
 def pump(source: socket.socket, sink: socket.socket, limit: float = float("inf")) -> None:
-    """Pass on what comes until an end hangs up, or `limit` bytes; then hang up both."""
+    """Pass on what comes until its end or `limit` bytes; then hang up on `sink`, and throw away the rest.
+
+    A socket closed before all is read would make the other end throw away what it has received, and gRPC drops
+    what a client has not asked for yet when the connection goes: it gets the time to ask.
+    """
     passed = 0
     with suppress(OSError):
         while passed < limit and (data := source.recv(4096)):
             sink.sendall(data)
             passed += len(data)
-    for end in (source, sink):
-        with suppress(OSError):
-            end.shutdown(socket.SHUT_RDWR)
+    if passed >= limit:
+        time.sleep(_TIME_TO_READ_S)
+    with suppress(OSError):
+        sink.shutdown(socket.SHUT_WR)
+    with suppress(OSError):
+        while source.recv(4096):
+            pass
 
 
 def files(folder: Path) -> list[str]:

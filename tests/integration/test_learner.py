@@ -141,7 +141,8 @@ def test_play_stream(learner: tuple[str, Path]) -> None:
             actor.send(actor.play(ticket))
             assert actor.ack() == ticket.episode_id
         assert actor.order().policy_version == 1
-        assert training.status().learner_step == 1
+        # Tickets of the next batch come while the step that moved the policy is still being made.
+        service.wait_for(lambda: training.status().learner_step == 1, "the end of the step")
         assert training.status().episodes == 4
 
 

@@ -140,8 +140,8 @@ def cutting(address: str, limit: int, connections: int) -> Iterator[str]:
 def pump(source: socket.socket, sink: socket.socket, limit: float = float("inf")) -> None:
     """Pass on what comes until its end or `limit` bytes; then hang up on `sink`, and throw away the rest.
 
-    A socket closed before all is read would make the other end throw away what it has received, and gRPC drops
-    what a client has not asked for yet when the connection goes: it gets the time to ask.
+    A socket closed before all is read would make the other end throw away what it has received, and gRPC
+    drops what a client has not asked for yet when the connection goes: it gets the time to ask.
     """
     passed = 0
     with suppress(OSError):

@@ -15,6 +15,8 @@ from pathlib import Path
 import psutil
 
 NETWORK = "10.77.0"
+# Where it really lies: a link to it may be in /tmp, of which each machine has its own.
+VENV = Path(sys.prefix).resolve()
 # A shell as first process takes in the orphans, as an init does.
 BOOT = """
 set -e
@@ -31,7 +33,7 @@ exec chroot . sh -c 'cd; '"$2"'; while true; do sleep 0.5; done'
 ENVIRONMENT = {
     "HOME": str(Path.home()),
     "USER": "root",
-    "PATH": f"{sys.prefix}/bin:/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin",
+    "PATH": f"{VENV}/bin:/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin",
     "RAY_AUTH_MODE": "disabled",
     "RAY_USAGE_STATS_ENABLED": "0",
 }

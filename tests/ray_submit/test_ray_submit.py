@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shutil
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -15,7 +14,7 @@ import yaml
 
 from liir_common.checkpoint import CheckpointStore
 from liir_common.files import read_table
-from tests.ray_submit.machines import SSHD, Machine
+from tests.ray_submit.machines import SSHD, VENV, Machine
 
 pytestmark = [pytest.mark.ray_submit, pytest.mark.timeout(1200)]
 
@@ -47,7 +46,7 @@ class Cluster:
         self._give_keys()
         self.user.boot("true", None)
         for machine in (self.head, self.worker):
-            (machine.home / "liir-venv").symlink_to(sys.prefix)
+            (machine.home / "liir-venv").symlink_to(VENV)
             machine.boot(SSHD, self.user)
 
     def end(self) -> None:

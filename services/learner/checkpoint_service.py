@@ -32,6 +32,7 @@ class CheckpointService(checkpoint_pb2_grpc.CheckpointServiceServicer):
         """Serve the checkpoints of `run`."""
         self._run = run
         self._changed = asyncio.Condition()
+        self._ended = False
         self._complete = False
         self.evaluations = {
             evaluation.episode: evaluation for evaluation in map(_from_row, run.evaluations.read())
@@ -50,9 +51,9 @@ class CheckpointService(checkpoint_pb2_grpc.CheckpointServiceServicer):
         async with self._changed:
             self._changed.notify_all()
 
-    async def complete(self) -> None:
-        """No checkpoint will follow: watchers end when they have seen all."""
-        self._complete = True
+    async def end(self, run_complete: bool) -> None:
+        """Send the watchers home: content once they have seen all of a complete run, else told to come back."""
+        self._ended, self._complete = True, run_complete
         await self.changed()
 
     async def wait_all_evaluated(self) -> None:
@@ -99,9 +100,11 @@ class CheckpointService(checkpoint_pb2_grpc.CheckpointServiceServicer):
                 seen = manifest.episode
             if self._complete:
                 return
+            if self._ended:
+                raise Refused(grpc.StatusCode.UNAVAILABLE, "the learner ends before the run is complete")
             async with self._changed:
                 # The trainer publishes before it notifies, so this cannot sleep through a checkpoint.
-                if not self._first_after(seen) and not self._complete:
+                if not self._first_after(seen) and not self._ended:
                     await self._changed.wait()
 
     async def ReportEvaluation(

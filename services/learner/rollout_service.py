@@ -174,6 +174,9 @@ class RolloutService(rollout_pb2_grpc.RolloutServiceServicer):
                 f"actor {hello.actor_id} would play other episodes: wanted {wanted}, got {got}; "
                 "start the actors from the learner's build",
             )
+        if self._drain is not None and not self._drain.run_complete:
+            # Not let in and sent home again, round and round: a refusal makes it wait longer each time.
+            raise Refused(grpc.StatusCode.UNAVAILABLE, f"{self._drain.reason}; come back when it is resumed")
         stream = ActorStream(hello.actor_id)
         self._streams.add(stream)
         self._empty.clear()
@@ -232,6 +235,8 @@ class RolloutService(rollout_pb2_grpc.RolloutServiceServicer):
         stream.ack(message.episode_id)
 
     def _assign(self) -> None:
+        if self._drain is not None:
+            return
         for stream, ticket in self._intake.assign(time.monotonic()):
             assert isinstance(stream, ActorStream)
             if stream.policy_version != ticket.policy_version:

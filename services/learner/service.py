@@ -103,8 +103,7 @@ async def _leave(
     trainer.progress.phase = training_pb2.PHASE_STOPPING
     await server.not_serving()
     await rollouts.drain("the learner ends", trainer.complete, _DRAIN_GRACE_S)
-    if trainer.complete:
-        await checkpoints.complete()
+    await checkpoints.end(trainer.complete)
     await server.stop(_STOP_GRACE_S)
     log.info("ended", run_complete=trainer.complete, learner_step=trainer.progress.counters.learner_step)
 

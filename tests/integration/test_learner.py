@@ -57,7 +57,7 @@ class Actor:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._outgoing.put(None)
+        self.leave()
         self._channel.close()
 
     def ask(self, tickets: int = 1) -> None:
@@ -89,6 +89,14 @@ class Actor:
 
     def play(self, ticket: Ticket) -> rollout_pb2.Trajectory:
         return codec.encode_trajectory(self.player.play(ticket), NO_STATS)
+
+    def leave(self) -> None:
+        """Half-close: nothing more will be sent."""
+        self._outgoing.put(None)
+
+    def rest(self) -> list[rollout_pb2.PlayResponse]:
+        """All that comes until the stream ends."""
+        return list(self._responses)
 
     def error(self) -> grpc.RpcError:
         with pytest.raises(grpc.RpcError) as caught:
@@ -404,6 +412,39 @@ def test_stop_saves_and_resume_goes_on(begin: list[str], resume: list[str], tmp_
     assert (ticket.episode_id, ticket.policy_version) == (8, 2)
     process.terminate()
     service.finish(process)
+
+
+def test_a_learner_that_ends_lets_nobody_in_and_cuts_nobody_off(tmp_path: Path) -> None:
+    """While one actor is still leaving, tickets stop, newcomers are to come later, watchers hear why it ends."""
+    run_dir = tmp_path / "run"
+    settings = ("training.batch_episodes=4", "training.checkpoint_interval=4")
+    process = service.start("learner", "--run-dir", str(run_dir), *service.arguments(settings))
+    service.wait_for((run_dir / "endpoints.json").exists, "the learner's start")
+    address = service.endpoints(run_dir)["address"]
+    play_batches(address, 1)
+    with Actor(address) as slow, CheckpointClient(address) as client, TrainingClient(address) as training:
+        slow.ask()
+        slow.order()
+        watched = client.watch()
+        assert next(watched).episode == 4
+        training.stop("test")
+        response = slow.receive()
+        assert response.HasField("drain")
+        assert not response.drain.run_complete
+        slow.ask()
+        with Actor(address) as newcomer:
+            newcomer.ask()
+            error = newcomer.error()
+        assert error.code() == grpc.StatusCode.UNAVAILABLE
+        assert "come back" in str(error.details())
+        assert training.status().actors == 1
+        slow.leave()
+        assert not [message for message in slow.rest() if message.tickets]
+        with pytest.raises(grpc.RpcError) as caught:
+            next(watched)
+        assert caught.value.code() == grpc.StatusCode.UNAVAILABLE
+        assert "before the run is complete" in str(caught.value.details())
+    assert "Traceback" not in service.finish(process)
 
 
 def test_a_run_has_one_learner_at_a_time(learner: tuple[str, Path]) -> None:

@@ -1,4 +1,4 @@
-"""Games that take what a method is for: QMIX's two-step game, agreement, memory, credit among many.
+"""Games that take what a method is for: QMIX's two-step game, a penalty game, memory, credit among many.
 
 They are played through the PettingZoo loop with the tickets and the kernel that actors use.
 """
@@ -102,11 +102,16 @@ class TwoStep(Game):
         return float((self.safe if self.where == 1 else self.risky)[actions[0]][actions[1]])
 
 
-class Agreement(Game):
-    """The penalty game of Claus and Boutilier (AAAI 1998) without a penalty: two best ways, if both agree."""
+class Penalty(Game):
+    """The penalty game of Claus and Boutilier (AAAI 1998): two best ways, a loss for those who disagree on
+    which, and a poor but safe third."""
 
     n_actions = 3
-    payoff = [[10, 0, 0], [0, 2, 0], [0, 0, 10]]  # noqa: RUF012
+    obs_dim = 2
+    payoff = [[10, 0, -2], [0, 2, 0], [-2, 0, 10]]  # noqa: RUF012
+
+    def sight(self, agent: int) -> list[float]:
+        return [float(agent == 0), float(agent == 1)]
 
     def play(self, actions: list[int]) -> float:
         return float(self.payoff[actions[0]][actions[1]])
@@ -190,7 +195,7 @@ def test_only_a_mixer_that_the_state_controls_finds_the_eight(name: str, found: 
 
 @pytest.mark.parametrize("name", ["liir", "central_v", "iac", "coma"])
 def test_policies_that_learn_together_agree_on_one_of_two_best_ways(name: str) -> None:
-    player = train(Agreement(), name, FASTER | {"entropy": 0.0}, updates=100, epsilon=0.2, seed=3)
+    player = train(Penalty(), name, FASTER | {"entropy": 0.0}, updates=100, epsilon=0.2, seed=3)
     assert mean_return(player, Exploration.GREEDY, episodes=1) == 10.0
 
 

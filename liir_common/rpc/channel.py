@@ -16,8 +16,14 @@ MAX_MESSAGE_BYTES = 32 * 2**20
 """Largest message either side takes; a 27m_vs_30m episode has about 7 MiB."""
 DEADLINE_S = 10.0
 """Of every unary call."""
-KEEPALIVE_MS, KEEPALIVE_TIMEOUT_MS = 5_000, 3_000
+KEEPALIVE_MS, KEEPALIVE_TIMEOUT_MS = 5_000, 7_000
 """A peer that answers no ping is given up after at most their sum."""
+KEEPALIVE_OPTIONS = (
+    ("grpc.keepalive_time_ms", KEEPALIVE_MS),
+    ("grpc.keepalive_timeout_ms", KEEPALIVE_TIMEOUT_MS),
+    # What gRPC really waits for the answer to a ping; a minute unless told so, whatever is above.
+    ("grpc.http2.ping_timeout_ms", KEEPALIVE_TIMEOUT_MS),
+)
 
 # Only UNAVAILABLE is retried, the call may not have arrived, and only for unary calls: who reads a stream
 # knows from where to go on. gRPC adds the jitter.
@@ -46,8 +52,7 @@ _SERVICE_CONFIG = {
 CHANNEL_OPTIONS = (
     ("grpc.max_receive_message_length", MAX_MESSAGE_BYTES),
     ("grpc.max_send_message_length", MAX_MESSAGE_BYTES),
-    ("grpc.keepalive_time_ms", KEEPALIVE_MS),
-    ("grpc.keepalive_timeout_ms", KEEPALIVE_TIMEOUT_MS),
+    *KEEPALIVE_OPTIONS,
     ("grpc.http2.max_pings_without_data", 0),
     ("grpc.max_reconnect_backoff_ms", 2_000),
     ("grpc.service_config", json.dumps(_SERVICE_CONFIG)),

@@ -24,8 +24,7 @@ log = structlog.get_logger()
 _OPTIONS = (
     ("grpc.max_receive_message_length", channel.MAX_MESSAGE_BYTES),
     ("grpc.max_send_message_length", channel.MAX_MESSAGE_BYTES),
-    ("grpc.keepalive_time_ms", channel.KEEPALIVE_MS),
-    ("grpc.keepalive_timeout_ms", channel.KEEPALIVE_TIMEOUT_MS),
+    *channel.KEEPALIVE_OPTIONS,
     ("grpc.http2.min_ping_interval_without_data_ms", channel.KEEPALIVE_MS // 2),
     ("grpc.http2.max_ping_strikes", 0),
     # Two learners on one port would each get half of the actors.

@@ -52,7 +52,7 @@ class CheckpointService(checkpoint_pb2_grpc.CheckpointServiceServicer):
             self._changed.notify_all()
 
     async def end(self, run_complete: bool) -> None:
-        """Send the watchers home: content once they have seen all of a complete run, else told to come back."""
+        """Send the watchers home: once they have seen all of a complete run, else told that it is not."""
         self._ended, self._complete = True, run_complete
         await self.changed()
 

@@ -105,11 +105,11 @@ class Faults:
         self._evaluator_link.cut()
 
     def stall_actors(self) -> None:
-        """Sometimes longer than keepalive waits (8 s), sometimes not."""
-        self.actors_link.stall(self._random.uniform(1, 11))
+        """Sometimes longer than keepalive waits (12 s), sometimes not."""
+        self.actors_link.stall(self._random.uniform(1, 16))
 
     def stall_evaluator(self) -> None:
-        self._evaluator_link.stall(self._random.uniform(1, 11))
+        self._evaluator_link.stall(self._random.uniform(1, 16))
 
     def delay_actors(self) -> None:
         self.actors_link.delay_s = self._random.uniform(0.3, 1.0)

@@ -7,6 +7,7 @@ import json
 import queue
 import re
 import socket
+import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from hashlib import sha256
@@ -33,6 +34,7 @@ from liir_common.rpc.channel import CHANNEL_OPTIONS, connect
 from liir_common.rpc.gen.liir.v1 import checkpoint_pb2, rollout_pb2, rollout_pb2_grpc
 from liir_common.types import Ticket, policy_shapes
 from tests.e2e import service
+from tests.faults.proxy import Proxy
 from tests.grpcurl import grpcurl, needs_grpcurl
 
 NO_STATS = rollout_pb2.ActorStats()
@@ -162,6 +164,30 @@ def test_tickets_of_a_broken_stream_go_to_the_next_actor(learner: tuple[str, Pat
     with Actor(address) as actor:
         actor.ask(1)
         assert actor.order().episode_id == 0
+
+
+def test_a_silent_peer_is_noticed_and_its_ticket_played_within_fifteen_seconds(
+    learner: tuple[str, Path],
+) -> None:
+    """Neither end of the connection hears anything; long before the ticket itself would expire."""
+    address, _ = learner
+    proxy = Proxy(int(address.rpartition(":")[2]))
+    try:
+        with Actor(proxy.address) as silent, Actor(address) as other, TrainingClient(address) as training:
+            silent.ask()
+            assert silent.order().episode_id == 0
+            other.ask(4)
+            assert [other.order().episode_id for _ in range(3)] == [1, 2, 3]
+            begin = time.monotonic()
+            proxy.stall(60.0)
+            assert other.order().episode_id == 0
+            assert time.monotonic() - begin < 15.0
+            assert training.status().actors == 1
+            # The actor's end notices as well.
+            assert silent.error().code() == grpc.StatusCode.UNAVAILABLE
+            assert time.monotonic() - begin < 15.0
+    finally:
+        proxy.close()
 
 
 def nan_reward(message: rollout_pb2.Trajectory) -> None:
@@ -415,7 +441,7 @@ def test_stop_saves_and_resume_goes_on(begin: list[str], resume: list[str], tmp_
 
 
 def test_a_learner_that_ends_lets_nobody_in_and_cuts_nobody_off(tmp_path: Path) -> None:
-    """While one actor is still leaving, tickets stop, newcomers are to come later, watchers hear why it ends."""
+    """While an actor is still leaving, tickets stop and newcomers are refused; watchers hear the reason."""
     run_dir = tmp_path / "run"
     settings = ("training.batch_episodes=4", "training.checkpoint_interval=4")
     process = service.start("learner", "--run-dir", str(run_dir), *service.arguments(settings))

@@ -9,8 +9,9 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from liir_common.config import METHOD_PRESETS, PRESETS, AlgorithmConfig
-from liir_common.types import Batch, EnvSpec, policy_shapes
+from liir_common.config import METHOD_PRESETS, PRESETS, AlgorithmConfig, EnvConfig
+from liir_common.rollout.play import make_player
+from liir_common.types import Batch, EnvSpec, Ticket, policy_shapes
 from services.learner.algorithms import Algorithm, make_algorithm
 from services.learner.bench import bench_learner, synthetic_batch
 
@@ -262,6 +263,17 @@ def test_divergence_is_an_error(method: str) -> None:
     batch = batch_of(0)
     with pytest.raises(FloatingPointError, match="diverged"):
         algorithm.update(replace(batch, reward=batch.reward + np.float32(np.inf)))
+
+
+def test_a_single_step_on_its_own_episodes_clips_nothing() -> None:
+    """The actors' kernel and the learner's products round differently, which is no clipping."""
+    player = make_player(EnvConfig(map="3m"))
+    config = AlgorithmConfig.model_validate(METHODS["coma"])
+    algorithm = make_algorithm(player.spec, config, 5, CPU)
+    player.load(algorithm.policy())
+    tickets = [Ticket.for_training(1, i, 0, config.behaviour, epsilon=0.1) for i in range(8)]
+    batch = Batch.from_trajectories([player.play(ticket) for ticket in tickets], epsilon=0.1)
+    assert algorithm.update(batch)["clip_fraction"] == 0
 
 
 def test_the_reward_ratio_is_left_out_where_no_extrinsic_reward_came() -> None:

@@ -86,7 +86,8 @@ class Policy:
                 "policy_entropy": entropy,
                 "policy_kl": data.mean(rho - 1 - log_rho),
                 "policy_gradient_norm": step.norm,
-                "clip_fraction": data.mean((weight != rho * advantage).to(rho.dtype)),
+                # With one step ρ is 1 but for rounding, which is not clipping.
+                "clip_fraction": data.mean((~torch.isclose(weight, rho * advantage)).to(rho.dtype)),
             },
         )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import queue
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 from liir_common.rpc.gen.liir.v1 import rollout_pb2
 
@@ -12,6 +12,18 @@ Outgoing = queue.SimpleQueue[rollout_pb2.PlayRequest | None]
 
 _TOGETHER_BYTES = 1 << 20
 """A message that is larger than this already takes no more with it."""
+
+
+def gather(trajectories: Iterable[rollout_pb2.Trajectory]) -> Iterator[rollout_pb2.PlayRequest]:
+    """What is played without waiting in between, in few messages."""
+    request = rollout_pb2.PlayRequest()
+    for trajectory in trajectories:
+        request.trajectories.append(trajectory)
+        if request.ByteSize() >= _TOGETHER_BYTES:
+            yield request
+            request = rollout_pb2.PlayRequest()
+    if request.trajectories:
+        yield request
 
 
 def put_together(outgoing: Outgoing) -> Iterator[rollout_pb2.PlayRequest]:

@@ -20,7 +20,7 @@ from liir_common.rollout.play import make_player
 from liir_common.rollout.player import Player
 from liir_common.rpc import carry, channel, codec
 from liir_common.rpc.gen.liir.v1 import rollout_pb2, rollout_pb2_grpc
-from liir_common.rpc.requests import Outgoing, put_together
+from liir_common.rpc.requests import Outgoing, gather, put_together
 from liir_common.rpc.tokens import Role
 
 log = structlog.get_logger()
@@ -51,6 +51,9 @@ class RolloutActor:
         self._compress = config.actors.compress
         self._player: Player = make_player(config.env, config.algorithm.policy_hidden)
         self._shapes = types.policy_shapes(self._player.spec, config.algorithm.policy_hidden)
+        self._version = -1
+        """Of the policy that this stream brought last."""
+        self._idle_since = 0.0
 
     def ready(self) -> str:
         """Ray's id of the node that the actor is on, once it is there."""
@@ -93,29 +96,32 @@ class RolloutActor:
             outgoing.put(None)  # ends our side, and the thread in which gRPC reads the queue
 
     def _answer(self, messages: Iterable[rollout_pb2.PlayResponse], outgoing: Outgoing) -> bool:
-        version, idle_since = -1, time.perf_counter()
+        self._version = -1
+        self._idle_since = time.perf_counter()
         for message in messages:
             if message.HasField("policy"):
                 self._player.load(codec.decode_policy(message.policy, self._shapes))
-                version = message.policy.version
-            for ticket in map(codec.decode_ticket, message.tickets):
-                if ticket.policy_version != version:
-                    raise RuntimeError(f"got a ticket for policy {ticket.policy_version}, have {version}")
-                begin = time.perf_counter()
-                trajectory = self._player.play(ticket)
-                end = time.perf_counter()
-                stats = rollout_pb2.ActorStats(
-                    play_seconds=end - begin,
-                    wait_seconds=begin - idle_since,
-                    peak_memory_bytes=_peak_memory(),
-                )
-                idle_since = end
-                encoded = codec.encode_trajectory(trajectory, stats, self._compress)
-                outgoing.put(rollout_pb2.PlayRequest(trajectories=[encoded]))
+                self._version = message.policy.version
+            for request in gather(map(self._play, map(codec.decode_ticket, message.tickets))):
+                outgoing.put(request)
             if message.HasField("drain"):
                 log.info("drained", reason=message.drain.reason)
                 return bool(message.drain.run_complete)
         return False
+
+    def _play(self, ticket: types.Ticket) -> rollout_pb2.Trajectory:
+        if ticket.policy_version != self._version:
+            raise RuntimeError(f"got a ticket for policy {ticket.policy_version}, have {self._version}")
+        begin = time.perf_counter()
+        trajectory = self._player.play(ticket)
+        end = time.perf_counter()
+        stats = rollout_pb2.ActorStats(
+            play_seconds=end - begin,
+            wait_seconds=begin - self._idle_since,
+            peak_memory_bytes=_peak_memory(),
+        )
+        self._idle_since = end
+        return codec.encode_trajectory(trajectory, stats, self._compress)
 
 
 def _peak_memory() -> int:

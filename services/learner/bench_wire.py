@@ -8,7 +8,7 @@ import os
 import queue
 import threading
 import time
-from collections.abc import AsyncIterator, MutableSequence
+from collections.abc import AsyncIterator, Iterable, Iterator, MutableSequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from statistics import median
@@ -24,7 +24,7 @@ from liir_common.rollout.policy import random_weights
 from liir_common.rpc import codec
 from liir_common.rpc.channel import CHANNEL_OPTIONS
 from liir_common.rpc.gen.liir.v1 import rollout_pb2, rollout_pb2_grpc
-from liir_common.rpc.requests import Outgoing, put_together
+from liir_common.rpc.requests import Outgoing, gather, put_together
 from liir_common.rpc.server import Server
 from liir_common.types import Exploration, Ticket, Trajectory, Weights
 from services.learner.algorithms import make_algorithm
@@ -225,7 +225,14 @@ def _client(
         for message in rollout_pb2_grpc.RolloutServiceStub(channel).Play(put_together(outgoing)):
             if message.HasField("policy"):
                 arrivals[index] = time.monotonic()
-            for ticket in message.tickets:
-                trajectory.episode_id = ticket.episode_id
-                trajectory.policy_version = ticket.policy_version
-                outgoing.put(rollout_pb2.PlayRequest(trajectories=[trajectory]))
+            for request in gather(_answers(trajectory, message.tickets)):
+                outgoing.put(request)
+
+
+def _answers(
+    trajectory: rollout_pb2.Trajectory, tickets: Iterable[rollout_pb2.Ticket]
+) -> Iterator[rollout_pb2.Trajectory]:
+    for ticket in tickets:
+        trajectory.episode_id = ticket.episode_id
+        trajectory.policy_version = ticket.policy_version
+        yield trajectory

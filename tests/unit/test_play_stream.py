@@ -8,7 +8,7 @@ import queue
 import pytest
 
 from liir_common.rpc.gen.liir.v1 import rollout_pb2, tensor_pb2
-from liir_common.rpc.requests import Outgoing, put_together
+from liir_common.rpc.requests import Outgoing, gather, put_together
 from services.learner.rollout_service import ActorStream
 
 
@@ -82,3 +82,12 @@ def test_requests_that_wait_are_put_together_up_to_a_size() -> None:
     assert episodes(outgoing) == [[1, 2], [3, 4]]
     outgoing.put(None)
     assert episodes(outgoing) == []
+
+
+def test_what_is_played_in_one_go_is_gathered_up_to_a_size() -> None:
+    """A message is sent as soon as it is large enough, not when all is played."""
+    played = iter([trajectory(1), trajectory(2, size=2 << 20), trajectory(3)])
+    requests = gather(request.trajectories[0] for request in played)
+    assert [t.episode_id for t in next(requests).trajectories] == [1, 2]
+    assert next(played).trajectories[0].episode_id == 3
+    assert list(requests) == []

@@ -82,13 +82,14 @@ def print_summary(run_dir: Path, summary: Summary) -> None:
 def write_results(run_dirs: Sequence[Path], output: Path) -> None:
     """Gather runs into `output`: runs.csv (a row per run), curves.csv (a row per evaluation), winrate.png."""
     output.mkdir(parents=True, exist_ok=True)
+    configs = [yaml.safe_load((run_dir / "config.yaml").read_text(encoding="utf-8")) for run_dir in run_dirs]
     groups: dict[str, list[Path]] = {}
+    for run_dir, label in zip(run_dirs, curve_labels([c["algorithm"] for c in configs]), strict=True):
+        groups.setdefault(label, []).append(run_dir)
     runs, curves = [], []
-    for run_dir in run_dirs:
-        config = yaml.safe_load((run_dir / "config.yaml").read_text(encoding="utf-8"))
+    for run_dir, config in zip(run_dirs, configs, strict=True):
         run = json.loads((run_dir / "run.json").read_text())
         label = method_label(config["algorithm"])
-        groups.setdefault(label, []).append(run_dir)
         about = {"run": run_dir.name, "method": label, "map": config["env"]["map"], "seed": config["seed"]}
         runs.append({**about, "commit": run["git"], **asdict(summarise(run_dir))})
         curves += [
@@ -108,6 +109,19 @@ def method_label(algorithm: Mapping[str, Any]) -> str:
     return ", ".join([algorithm["name"], *chosen])
 
 
+def curve_labels(algorithms: Sequence[Mapping[str, Any]]) -> list[str]:
+    """The method of each, and the settings in which it differs from others of that method."""
+    methods = [method_label(algorithm) for algorithm in algorithms]
+    labels = []
+    for method, algorithm in zip(methods, algorithms, strict=True):
+        alike = [other for name, other in zip(methods, algorithms, strict=True) if name == method]
+        apart = [
+            f"{key} {algorithm[key]}" for key in algorithm if any(o[key] != algorithm[key] for o in alike)
+        ]
+        labels.append(", ".join([method, *apart]))
+    return labels
+
+
 def plot_win_rate(groups: dict[str, list[Path]], output: Path) -> None:
     """Draw greedy (solid) and sampled (faint) win rate against environment steps, a colour per group."""
     from matplotlib.figure import Figure
@@ -125,7 +139,7 @@ def plot_win_rate(groups: dict[str, list[Path]], output: Path) -> None:
     axes.set(xlabel="environment steps", ylabel="win rate", ylim=(-0.02, 1.02))
     axes.axhline(_LEVEL, color="grey", lw=0.8, ls=":")
     axes.grid(alpha=0.25)
-    axes.legend(loc="lower right")
+    axes.legend(loc="best", fontsize=8)
     axes.set_title("Win rate of frozen checkpoints, mean of five evaluations", fontsize=10)
     figure.savefig(output, dpi=120)
 

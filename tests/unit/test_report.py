@@ -8,7 +8,7 @@ import yaml
 
 from liir_common import config
 from liir_common.files import Table, read_table
-from liir_common.report import summarise, write_report, write_results
+from liir_common.report import curve_labels, summarise, write_report, write_results
 
 
 def make_run(path: Path, greedy: list[float]) -> Path:
@@ -72,3 +72,10 @@ def test_results_gather_runs_by_method(tmp_path: Path) -> None:
     assert len(read_table(tmp_path / "results" / "curves.csv")) == 6
     assert config.load(tmp_path / "results" / "b.yaml", ["preset=none"]).algorithm.lambda_ == 0
     assert (tmp_path / "results" / "winrate.png").exists()
+
+
+def test_curves_of_one_method_are_named_by_the_settings_that_differ() -> None:
+    settings = ([], [], ["algorithm.entropy=0.01"], ["algorithm.name=central_v"])
+    algorithms = [config.load(None, chosen).tree()["algorithm"] for chosen in settings]
+    plain = "liir, entropy 0.03"
+    assert curve_labels(algorithms) == [plain, plain, "liir, entropy 0.01", "central_v"]

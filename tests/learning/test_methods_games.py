@@ -139,6 +139,26 @@ class Memory(Game):
         return float(np.mean(actions == self.signs)) if self.t == 2 else 0.0
 
 
+class Targets(Game):
+    """Shooting always beats walking; which of two targets pays more changes with every step and is seen."""
+
+    episode_limit = 8
+    n_actions = 6
+    obs_dim = 12
+    targets = 2
+
+    def begin(self, rng: np.random.Generator) -> None:
+        self.marks = rng.integers(0, self.targets, (self.episode_limit + 1, self.n_agents))
+
+    def sight(self, agent: int) -> list[float]:
+        mark = float(self.marks[self.t, agent])
+        return [mark, 1 - mark] + [1.0] * 10
+
+    def play(self, actions: list[int]) -> float:
+        hits = np.array(actions) == self.marks[self.t]
+        return float(np.mean((np.array(actions) < self.targets) + hits.astype(float))) / self.episode_limit
+
+
 class Levers(Game):
     """Twelve agents with a lever each that has to be left or pulled; the team gets the sum."""
 
@@ -163,7 +183,7 @@ def train(
     """A player of what is learned from `updates` batches of `episodes`, each played by the newest policy."""
     of_method = METHOD_PRESETS.get(name, {})
     config = AlgorithmConfig.model_validate({"policy_hidden": HIDDEN} | of_method | settings | {"name": name})
-    player = LoopPlayer(game, loop_spec(game, type(game).__name__, {}), HIDDEN)
+    player = LoopPlayer(game, loop_spec(game, type(game).__name__, {}), config.policy_hidden)
     algorithm = make_algorithm(player.spec, config, seed, torch.device("cpu"))
     for version in range(updates):
         player.load(algorithm.policy())
@@ -205,6 +225,16 @@ def test_memory_beats_what_can_be_seen(name: str) -> None:
     settings = FASTER | OFTEN if name in ("iql", "vdn", "qmix") else FASTER | {"target_interval": 0}
     player = train(Memory(), name, settings, updates=100, epsilon=0.3, seed=3)
     assert mean_return(player, Exploration.GREEDY, episodes=64) > 0.95
+
+
+@pytest.mark.parametrize("name", ["liir", "central_v", "iac"])
+def test_a_policy_that_has_learned_the_obvious_still_sees(name: str) -> None:
+    """From a small head, learning what is good everywhere saturates the GRU, and the policy goes blind."""
+    small = FASTER | {"policy_hidden": 64}
+    player = train(Targets(), name, small, updates=40, epsilon=0.1, seed=1)
+    assert mean_return(player, Exploration.GREEDY, episodes=64) > 1.9
+    player = train(Targets(), name, small | {"policy_gain": 0.01}, updates=40, epsilon=0.1, seed=1)
+    assert mean_return(player, Exploration.GREEDY, episodes=64) < 1.6
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])

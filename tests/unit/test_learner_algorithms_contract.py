@@ -13,6 +13,7 @@ from liir_common.config import METHOD_PRESETS, PRESETS, AlgorithmConfig, EnvConf
 from liir_common.rollout.play import make_player
 from liir_common.types import Batch, EnvSpec, Ticket, policy_shapes
 from services.learner.algorithms import Algorithm, make_algorithm
+from services.learner.algorithms.networks import views
 from services.learner.bench import bench_learner, synthetic_batch
 
 # On products this small a second thread only waits, and it spins while it does.
@@ -274,6 +275,16 @@ def test_a_single_step_on_its_own_episodes_clips_nothing() -> None:
     tickets = [Ticket.for_training(1, i, 0, config.behaviour, epsilon=0.1) for i in range(8)]
     batch = Batch.from_trajectories([player.play(ticket) for ticket in tickets], epsilon=0.1)
     assert algorithm.update(batch)["clip_fraction"] == 0
+
+
+@pytest.mark.parametrize("method", ON_POLICY)
+def test_a_saturated_policy_is_seen_in_its_hidden_std(method: str) -> None:
+    algorithm = make(method)
+    assert algorithm.update(batch_of(0))["policy_hidden_std"] > 0.03
+    state = algorithm.state()
+    views(state["policy.parameters"], policy_shapes(SPEC, 8))["gru.bias_ih"].fill_(50)
+    algorithm.load_state(state)
+    assert algorithm.update(batch_of(1))["policy_hidden_std"] < 0.001
 
 
 def test_the_reward_ratio_is_left_out_where_no_extrinsic_reward_came() -> None:

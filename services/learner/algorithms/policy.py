@@ -85,6 +85,8 @@ class Policy:
             {
                 "policy_entropy": entropy,
                 "policy_kl": data.mean(rho - 1 - log_rho),
+                # Near 0 the GRU has saturated: it passes nothing on of what the agent sees.
+                "policy_hidden_std": before.trace.gru.h.std(0, correction=0).mean(),
                 "policy_gradient_norm": step.norm,
                 # With one step ρ is 1 but for rounding, which is not clipping.
                 "clip_fraction": data.mean((~torch.isclose(weight, rho * advantage)).to(rho.dtype)),

@@ -131,7 +131,7 @@ class AlgorithmConfig(Section):
     entropy: float = Field(0.03, ge=0)
     orthogonal_init: bool = True
     policy_gain: float = Field(3.0, gt=0)
-    """Gain of the policy head under orthogonal init; a small one lets the GRU saturate (docs/algorithm.md)."""
+    """Gain of the policy head under orthogonal init; a small one saturates the GRU (docs/algorithm.md)."""
     r_in_gain: float = Field(0.1, gt=0)
     """Scale of the r_in head at the start."""
     policy_hidden: int = Field(64, ge=1)

@@ -84,7 +84,7 @@ def write_results(run_dirs: Sequence[Path], output: Path) -> None:
     output.mkdir(parents=True, exist_ok=True)
     configs = [yaml.safe_load((run_dir / "config.yaml").read_text(encoding="utf-8")) for run_dir in run_dirs]
     groups: dict[str, list[Path]] = {}
-    for run_dir, label in zip(run_dirs, curve_labels([c["algorithm"] for c in configs]), strict=True):
+    for run_dir, label in zip(run_dirs, curve_labels(configs), strict=True):
         groups.setdefault(label, []).append(run_dir)
     runs, curves = [], []
     for run_dir, config in zip(run_dirs, configs, strict=True):
@@ -109,24 +109,33 @@ def method_label(algorithm: Mapping[str, Any]) -> str:
     return ", ".join([algorithm["name"], *chosen])
 
 
-def curve_labels(algorithms: Sequence[Mapping[str, Any]]) -> list[str]:
-    """The method of each, and the settings in which it differs from others of that method."""
-    methods = [method_label(algorithm) for algorithm in algorithms]
+def curve_labels(configs: Sequence[Mapping[str, Any]]) -> list[str]:
+    """The method of each, its map where there are several, and its differences from others of that method."""
+    methods = [method_label(config["algorithm"]) for config in configs]
+    settings = [{"map": config["env"]["map"]} | _leaves(config["algorithm"]) for config in configs]
+    several_maps = len({own["map"] for own in settings}) > 1
     labels = []
-    for method, algorithm in zip(methods, algorithms, strict=True):
-        alike = [other for name, other in zip(methods, algorithms, strict=True) if name == method]
+    for method, own in zip(methods, settings, strict=True):
+        alike = [other for name, other in zip(methods, settings, strict=True) if name == method]
         apart = [
-            f"{key} {algorithm[key]}" for key in algorithm if any(o[key] != algorithm[key] for o in alike)
+            f"{key} {own[key]}" for key in own if key != "map" and any(o[key] != own[key] for o in alike)
         ]
-        labels.append(", ".join([method, *apart]))
+        labels.append(", ".join([*([own["map"]] if several_maps else []), method, *apart]))
     return labels
+
+
+def _leaves(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in tree.items():
+        flat |= _leaves(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+    return flat
 
 
 def plot_win_rate(groups: dict[str, list[Path]], output: Path) -> None:
     """Draw greedy (solid) and sampled (faint) win rate against environment steps, a colour per group."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(7, 4), layout="constrained")
+    figure = Figure(figsize=(7, 4 + 0.2 * len(groups)), layout="constrained")
     axes = figure.subplots()
     for number, (label, run_dirs) in enumerate(groups.items()):
         for run_dir in run_dirs:
@@ -134,13 +143,15 @@ def plot_win_rate(groups: dict[str, list[Path]], output: Path) -> None:
             steps = [int(row["env_steps"]) for row in tests]
             for actions, alpha in (("greedy", 1.0), ("sampled", 0.35)):
                 rates = [float(row[f"{actions}_win_rate"]) for row in tests]
-                name = f"{label}, {actions}" if run_dir is run_dirs[0] else None
+                name = label if run_dir is run_dirs[0] and actions == "greedy" else None
                 axes.plot(steps, _smooth(rates), color=f"C{number}", label=name, alpha=alpha)
     axes.set(xlabel="environment steps", ylabel="win rate", ylim=(-0.02, 1.02))
     axes.axhline(_LEVEL, color="grey", lw=0.8, ls=":")
     axes.grid(alpha=0.25)
-    axes.legend(loc="best", fontsize=8)
-    axes.set_title("Win rate of frozen checkpoints, mean of five evaluations", fontsize=10)
+    figure.legend(loc="outside lower left", fontsize=8)
+    axes.set_title(
+        "Win rate of frozen checkpoints, mean of five evaluations: greedy, faint: sampled", fontsize=10
+    )
     figure.savefig(output, dpi=120)
 
 

@@ -75,7 +75,12 @@ def test_results_gather_runs_by_method(tmp_path: Path) -> None:
 
 
 def test_curves_of_one_method_are_named_by_the_settings_that_differ() -> None:
-    settings = ([], [], ["algorithm.entropy=0.03"], ["algorithm.name=central_v"])
-    algorithms = [config.load(None, chosen).tree()["algorithm"] for chosen in settings]
-    plain = "liir, entropy 0.01"
-    assert curve_labels(algorithms) == [plain, plain, "liir, entropy 0.03", "central_v"]
+    settings = ([], [], ["algorithm.policy_optimizer.lr=0.1"], ["algorithm.name=central_v"])
+    configs = [config.load(None, chosen).tree() for chosen in settings]
+    plain, other = "liir, policy_optimizer.lr 0.0005", "liir, policy_optimizer.lr 0.1"
+    assert curve_labels(configs) == [plain, plain, other, "central_v"]
+
+
+def test_curves_of_several_maps_are_named_by_their_map() -> None:
+    configs = [config.load(None, [f"env.map={name}"]).tree() for name in ("3m", "8m")]
+    assert curve_labels(configs) == ["3m, liir", "8m, liir"]

@@ -7,8 +7,8 @@ adds is who may do what, the reward and the end of the episode.
 import numpy as np
 
 from liir_common import rng, seeds
-from liir_common.battle.tables import FIRST_ATTACK, apart, inlined, kernel
-from liir_common.battle.terrain import GROUND, MAP_SIZE
+from liir_common.battle.motion import separate, squared_distance, walk
+from liir_common.battle.tables import ATTACK, ATTACK_MOVE, FIRST_ATTACK, IDLE, MOVE, apart, inlined, kernel
 from liir_common.battle.units import (
     BEAM_LENGTH,
     BEAM_WIDTH,
@@ -31,9 +31,6 @@ STEPS, TERMINATED, TRUNCATED, WON, DEAD_ALLIES, DEAD_ENEMIES, LOST = range(7)
 """Places in `Battle.status`."""
 
 NO_OP, STOP, NORTH, SOUTH, EAST, WEST = range(FIRST_ATTACK)
-IDLE, MOVE, ATTACK, ATTACK_MOVE = range(4)
-"""Only a unit that attack-moves picks targets of its own: all enemies do, no ally does."""
-ORDERS = ("idle", "move", "attack", "attack_move")
 
 CHASE_LIMIT = 21.0
 HELP_RADIUS, HELP_PERIOD = 4.0, 2.0 * LOOPS_PER_SECOND
@@ -77,7 +74,7 @@ def _prey(rules, battle, i):
         return np.int64(rng.uniform(battle.stream) * rules.n_allies)
     prey = 0
     for j in range(rules.n_allies):
-        if _distance2(battle, i, j) < _distance2(battle, i, prey):
+        if squared_distance(battle, i, j) < squared_distance(battle, i, prey):
             prey = j
     return prey
 
@@ -241,7 +238,7 @@ def _play_loop(tables, battle, upwards):
     if tables.rules[0].has_areas:
         _blast_all(tables, battle, now)
     if walkers:
-        _separate(tables, battle, now)
+        separate(tables, battle, now)
     battle.clock[0] = now + 1.0
 
 
@@ -268,7 +265,7 @@ def _act(tables, battle, i, now, upwards):
         return _attack(tables, battle, i, now)
     if unit.order == IDLE:
         return False
-    return _walk(tables, battle, i, unit.goal_x - battle.x[i], unit.goal_y - battle.y[i], now)
+    return walk(tables, battle, i, unit.goal_x - battle.x[i], unit.goal_y - battle.y[i], now)
 
 
 @inlined
@@ -281,7 +278,7 @@ def _acquire(tables, battle, i, now, upwards):
     if unit.target >= 0:
         target = np.uint64(unit.target)
         if units[target].alive:
-            distance2 = _distance2(battle, i, target)
+            distance2 = squared_distance(battle, i, target)
             if distance2 <= tables.pairs[kind, tables.specs[target].kind].hold2:
                 return
             if rules.chase_attacker and unit.target == unit.attacker and distance2 <= CHASE_LIMIT**2:
@@ -295,16 +292,10 @@ def _acquire(tables, battle, i, now, upwards):
     for k in range(rules.n_allies):
         j = np.uint64(k if upwards else rules.n_allies - 1 - k)
         if units[j].alive:
-            distance2 = _distance2(battle, i, j)
+            distance2 = squared_distance(battle, i, j)
             if distance2 < nearest2 and distance2 <= tables.pairs[kind, tables.specs[j].kind].scan2:
                 nearest2 = distance2
                 unit.target = j
-
-
-@inlined
-def _distance2(battle, i, j):
-    x, y = battle.x[j] - battle.x[i], battle.y[j] - battle.y[i]
-    return x * x + y * y
 
 
 @inlined
@@ -331,7 +322,7 @@ def _attack(tables, battle, i, now):
         return False
     x, y = battle.x[target] - battle.x[i], battle.y[target] - battle.y[i]
     if x * x + y * y > tables.pairs[spec.kind, tables.specs[target].kind].reach2:
-        return _walk(tables, battle, i, x, y, now)
+        return walk(tables, battle, i, x, y, now)
     if now >= unit.ready_at:
         if tables.rules[0].has_areas:
             if spec.blast > 0.0:
@@ -424,7 +415,7 @@ def _respond(tables, battle, victim, now):
     for i in range(rules.n_allies, len(battle.units)):
         friend = battle.units[i]
         waits = friend.alive and friend.order == ATTACK_MOVE and friend.target < 0
-        if waits and _distance2(battle, victim, i) <= HELP_RADIUS**2 and _can_hit(tables, i, attacker):
+        if waits and squared_distance(battle, victim, i) <= HELP_RADIUS**2 and _can_hit(tables, i, attacker):
             friend.target = friend.attacker = attacker
 
 
@@ -482,7 +473,7 @@ def _blast_all(tables, battle, now):
             unit.hits = 0
             for j in range(_first_enemy(rules, i), _last_enemy(rules, i)):
                 within = spec.blast + tables.specs[j].radius
-                if battle.units[j].alive and _distance2(battle, i, j) <= within * within:
+                if battle.units[j].alive and squared_distance(battle, i, j) <= within * within:
                     _strike(tables, battle, i, j, now)
                     more |= not battle.units[j].alive
 
@@ -508,7 +499,7 @@ def _treat(tables, battle, i, now):
             return False
     elif unit.order == IDLE:
         return False
-    return _walk(tables, battle, i, x, y, now)
+    return walk(tables, battle, i, x, y, now)
 
 
 @inlined
@@ -525,7 +516,7 @@ def _patient(tables, battle, i):
     patient, least, nearest2 = -1, 1.0, np.inf
     for j in range(first, last):
         if _may_treat(tables, battle, i, j):
-            share, distance2 = battle.units[j].health / tables.specs[j].health, _distance2(battle, i, j)
+            share, distance2 = battle.units[j].health / tables.specs[j].health, squared_distance(battle, i, j)
             if share < least or (share == least and distance2 < nearest2):
                 patient, least, nearest2 = j, share, distance2
     return patient
@@ -535,7 +526,7 @@ def _patient(tables, battle, i):
 def _may_treat(tables, battle, i, j):
     """Whether j is alive, biological, hurt and within the search range of healer i."""
     spec = tables.specs[j]
-    near = _distance2(battle, i, j) <= tables.pairs[tables.specs[i].kind, spec.kind].scan2
+    near = squared_distance(battle, i, j) <= tables.pairs[tables.specs[i].kind, spec.kind].scan2
     return near and battle.units[j].alive and spec.biological and battle.units[j].health < spec.health
 
 
@@ -574,114 +565,3 @@ def _redirect(tables, battle, i):
         if battle.units[j].alive and distance2 < nearest2:
             nearest, nearest2 = j, distance2
     return nearest
-
-
-@inlined
-def _walk(tables, battle, i, x, y, now):
-    """One loop of walking along (x, y), the way to the goal; a goal nearer than that is reached.
-
-    Whether it walks.
-    """
-    unit, spec, distance2 = battle.units[i], tables.specs[i], x * x + y * y
-    if now < unit.free_at or distance2 == 0.0:
-        return False
-    if tables.rules[0].has_obstacles and spec.layer == GROUND:
-        x, y = _around(tables, battle, i, x, y)
-        distance2 = x * x + y * y
-    speed = spec.speed
-    if tables.rules[0].has_healers:
-        # Only aircraft take more than a loop to get going.
-        unit.pace = speed = min(
-            speed, (unit.pace if unit.walked_at == now - 1.0 else 0.0) + spec.acceleration
-        )
-    share = min(1.0, speed / np.sqrt(distance2))
-    unit.heading_x, unit.heading_y = x * share, y * share
-    unit.walked_at = now
-    _displace(tables, battle, i, unit.heading_x, unit.heading_y)
-    return True
-
-
-@apart
-def _around(tables, battle, i, x, y):
-    """The way to the next bend, or (x, y) where nothing stands in that way."""
-    to_x = min(max(int(battle.x[i] + x), 0), MAP_SIZE - 1)
-    to_y = min(max(int(battle.y[i] + y), 0), MAP_SIZE - 1)
-    start = int(battle.x[i]) * MAP_SIZE + int(battle.y[i])
-    bend = tables.routes[start, to_x * MAP_SIZE + to_y]
-    if bend < 0:
-        return x, y
-    return bend // MAP_SIZE + 0.5 - battle.x[i], bend % MAP_SIZE + 0.5 - battle.y[i]
-
-
-@inlined
-def _displace(tables, battle, i, x, y):
-    """Move a unit, axis by axis, as far as the ground allows; so units slide along walls."""
-    cells = tables.layers[tables.specs[i].layer]
-    if cells[_cell(battle.x[i] + x), _cell(battle.y[i])]:
-        battle.x[i] += x
-    if cells[_cell(battle.x[i]), _cell(battle.y[i] + y)]:
-        battle.y[i] += y
-
-
-@inlined
-def _cell(position):
-    """The cell of a position along one axis; the map's size is a power of two, so masking keeps within it."""
-    return np.uint32(np.int64(position) & (MAP_SIZE - 1))
-
-
-@inlined
-def _separate(tables, battle, now):
-    """Push overlapping discs apart; only units that walked in this loop can have made an overlap."""
-    for i in range(len(battle.units)):
-        if battle.units[i].walked_at == now and battle.units[i].alive:
-            contact2 = tables.contact2[tables.specs[i].kind]
-            # Everybody touches himself.
-            if _count_touched(battle, i, contact2) > 1:
-                _separate_one(tables, battle, i, contact2, now)
-
-
-@inlined
-def _count_touched(battle, i, contact2):
-    """How many units overlap i, dead or alive and i among them: a quick test, as `_count_near` is."""
-    count = 0
-    for j in range(len(contact2)):
-        count += _distance2(battle, i, j) < contact2[j]
-    return count
-
-
-@inlined
-def _separate_one(tables, battle, i, contact2, now):
-    for j in range(len(contact2)):
-        distance2 = _distance2(battle, i, j)
-        if distance2 < contact2[j] and j != i and battle.units[j].alive:
-            both_walked = battle.units[j].walked_at == now
-            if not (both_walked and j < i):
-                contact = tables.pairs[tables.specs[i].kind, tables.specs[j].kind].contact
-                _part(tables, battle, i, j, np.sqrt(distance2), contact, both_walked)
-
-
-@inlined
-def _part(tables, battle, i, j, distance, contact, both_walked):
-    """Unit i walked into unit j: walkers and idle friends give way half, all others stand firm."""
-    rules, overlap, x, y = tables.rules[0], contact - distance, 1.0, 0.0
-    if distance > 0.0:
-        x, y = (battle.x[i] - battle.x[j]) / distance, (battle.y[i] - battle.y[j]) / distance
-    is_friend = (i < rules.n_allies) == (j < rules.n_allies)
-    if both_walked:
-        _give_way(tables, battle, i, x, y, 0.5 * overlap)
-        _give_way(tables, battle, j, -x, -y, 0.5 * overlap)
-    elif rules.push_idle and is_friend and battle.units[j].order == IDLE:
-        _give_way(tables, battle, i, x, y, 0.5 * overlap)
-        _displace(tables, battle, j, -0.5 * overlap * x, -0.5 * overlap * y)
-    else:
-        _give_way(tables, battle, i, x, y, overlap)
-
-
-@inlined
-def _give_way(tables, battle, i, x, y, overlap):
-    """Back off along (x, y), away from the blocker, and go around it on the side of the heading."""
-    unit, slide = battle.units[i], 0.0
-    if unit.heading_x * x + unit.heading_y * y < 0.0:
-        leftward = unit.heading_y * x - unit.heading_x * y >= 0.0
-        slide = tables.rules[0].slide if leftward else -tables.rules[0].slide
-    _displace(tables, battle, i, overlap * (x - slide * y), overlap * (y + slide * x))

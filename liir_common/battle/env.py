@@ -24,7 +24,7 @@ from liir_common.battle.spaces import (
     joint_action,
     masked_observations,
 )
-from liir_common.battle.tables import build_battle, build_tables, roster
+from liir_common.battle.tables import ORDERS, build_battle, build_tables, roster
 from liir_common.battle.units import ENERGY_MAX
 from liir_common.types import EnvSpec
 
@@ -55,7 +55,7 @@ class UnitRecord(TypedDict):
     radius: float
     alive: bool
     order: str
-    """One of `engine.ORDERS`"""
+    """One of `tables.ORDERS`"""
     target: int | None
     """Number of the unit attacked, within the other team; of the unit healed, within its own"""
 
@@ -205,7 +205,7 @@ class BattleEnv(ParallelEnv[str, Observation, np.int64]):
             cooldown=max(0.0, float(unit["ready_at"] - self._battle.clock[0])),
             radius=float(spec["radius"]),
             alive=bool(unit["alive"]),
-            order=engine.ORDERS[unit["order"]],
+            order=ORDERS[unit["order"]],
             target=None if target < 0 else target - n if target >= n else target,
         )
 
@@ -229,11 +229,11 @@ class BattleEnv(ParallelEnv[str, Observation, np.int64]):
             )
         if record["alive"] != (record["health"] > 0):
             raise ValueError(f"{record['team']} {record['id']}: alive wants to mean health above 0")
-        if record["order"] not in engine.ORDERS:
-            raise ValueError(f"order wants one of {engine.ORDERS}, got {record['order']!r}")
+        if record["order"] not in ORDERS:
+            raise ValueError(f"order wants one of {ORDERS}, got {record['order']!r}")
         self._battle.x[i], self._battle.y[i] = x, y
         unit["health"], unit["shield"], unit["energy"] = record["health"], record["shield"], record["energy"]
-        unit["alive"], unit["order"] = record["alive"], engine.ORDERS.index(record["order"])
+        unit["alive"], unit["order"] = record["alive"], ORDERS.index(record["order"])
         unit["ready_at"], unit["free_at"], unit["hits"] = now + record["cooldown"], now, 0
         unit["hurt_at"] = now
         if i < n:

@@ -45,6 +45,9 @@ apart = njit(**_OPTIONS)
 
 FIRST_ATTACK = 6
 """Actions below: no-op, stop, north, south, east, west."""
+IDLE, MOVE, ATTACK, ATTACK_MOVE = range(4)
+"""Only a unit that attack-moves picks targets of its own: all enemies do, no ally does."""
+ORDERS = ("idle", "move", "attack", "attack_move")
 SIGHT, SHOOT_RANGE = 9.0, 6.0
 """SMAC v1's ranges, from centre to centre and for all unit types."""
 SURROUNDINGS = ((0, 4), (0, -4), (4, 0), (-4, 0), (2, 2), (-2, -2), (2, -2), (-2, 2))

@@ -112,8 +112,8 @@ class AlgorithmConfig(Section):
     """Control: η stays as initialised."""
     outer_samples: Literal["reuse", "fresh"] = "reuse"
     """Step 5 of Algorithm 1: reuse D with importance weights, or judge θ' on the next batch."""
-    r_in_bound: float = Field(10.0, gt=0)
-    """r_in is squashed to ± this value."""
+    r_in_bound: float = Field(1.0, gt=0)
+    """r_in is squashed to ± this value; the paper has no bound, and without one it grows for ever."""
     gamma: float = Field(0.99, ge=0, le=1)
     gae_lambda: float = Field(0.95, ge=0, le=1)
     """λ_g of the returns that values and advantages are made from; 0 is TD(0) as the paper prints it."""
@@ -355,6 +355,7 @@ PRESETS: Mapping[str, dict[str, Any]] = {
     "paper": {
         "env": {"options": {"reward_only_positive": False, "state_last_action": False}},
         "algorithm": {
+            "r_in_bound": 10.0,
             "gae_lambda": 0.8,
             "normalize_advantages": False,
             "normalize_values": False,

@@ -79,6 +79,12 @@ class OptimizerConfig(Section):
     """Largest norm of the gradient."""
 
 
+class EtaOptimizerConfig(OptimizerConfig):
+    """η's: its gradient is 1e-5 to 2e-4 in all, so that the eps of the others would freeze it."""
+
+    eps: float = Field(1e-10, gt=0)
+
+
 class ReplayConfig(Section):
     """What value-based methods learn from."""
 
@@ -136,7 +142,7 @@ class AlgorithmConfig(Section):
     """Scale of the r_in head at the start."""
     policy_hidden: int = Field(64, ge=1)
     policy_optimizer: OptimizerConfig = OptimizerConfig()
-    eta_optimizer: OptimizerConfig = OptimizerConfig(eps=1e-10)
+    eta_optimizer: EtaOptimizerConfig = EtaOptimizerConfig()
     critic_optimizer: OptimizerConfig = OptimizerConfig()
     exploration: ExplorationConfig = ExplorationConfig()
     meta_gradient: Literal["jvp", "difference"] = "jvp"
@@ -366,7 +372,6 @@ PRESETS: Mapping[str, dict[str, Any]] = {
             "orthogonal_init": False,
             "exploration": {"start": 0.5, "end": 0.01, "steps": 50_000},
             "policy_optimizer": _RMSPROP,
-            # ‖∇η‖ is 1e-5 to 2e-4: with the eps of the others η would hardly move.
             "eta_optimizer": _RMSPROP | {"eps": 1e-10},
             "critic_optimizer": _RMSPROP,
         },

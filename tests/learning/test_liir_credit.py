@@ -32,6 +32,7 @@ SETTINGS = {
     "critic_epochs": 2,
     "entropy": 0.0,
     "policy_hidden": 16,
+    "policy_gain": 0.01,  # these observations are large: from more it would begin with its mind made up
     "policy_optimizer": {"lr": 1e-4},
 }
 

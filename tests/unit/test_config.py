@@ -71,6 +71,11 @@ def test_security_may_be_the_folder_of_a_role(tmp_path: Path) -> None:
         config.load(None, [f"security={tmp_path / 'operator'}"])
 
 
+def test_another_rate_for_eta_leaves_its_eps_alone() -> None:
+    """With the eps of the other optimisers η would hardly move."""
+    assert config.load(None, ["algorithm.eta_optimizer.lr=0.1"]).algorithm.eta_optimizer.eps == 1e-10
+
+
 def test_presets_set_options_of_smacs_rules_only() -> None:
     settings = ["env=pettingzoo", "env.factory=games.pursuit:parallel_env", "env.options.horizon=9"]
     for preset in ("strong", "paper", "none"):

@@ -134,7 +134,7 @@ class AlgorithmConfig(Section):
     critic_epochs: int = Field(4, ge=1)
     ratio_clip: float = Field(0.2, gt=0)
     """Clip of the importance ratio in policy steps; a single step per batch truncates it at 1 instead."""
-    entropy: float = Field(0.01, ge=0)
+    entropy: float = Field(0.03, ge=0)
     orthogonal_init: bool = True
     policy_gain: float = Field(3.0, gt=0)
     """Gain of the policy head under orthogonal init; a small one saturates the GRU (docs/algorithm.md)."""

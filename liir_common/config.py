@@ -80,7 +80,7 @@ class OptimizerConfig(Section):
 
 
 class EtaOptimizerConfig(OptimizerConfig):
-    """η's: its gradient is 1e-5 to 2e-4 in all, so that the eps of the others would freeze it."""
+    """η's: the norm of its gradient is 1e-5 to 1e-3, so that the eps of the others would freeze it."""
 
     eps: float = Field(1e-10, gt=0)
 

@@ -112,15 +112,13 @@ def method_label(algorithm: Mapping[str, Any]) -> str:
 def curve_labels(configs: Sequence[Mapping[str, Any]]) -> list[str]:
     """The method of each, its map where there are several, and its differences from others of that method."""
     methods = [method_label(config["algorithm"]) for config in configs]
-    settings = [{"map": config["env"]["map"]} | _leaves(config["algorithm"]) for config in configs]
-    several_maps = len({own["map"] for own in settings}) > 1
+    maps = [config["env"]["map"] for config in configs]
+    settings = [_leaves(config["algorithm"]) for config in configs]
     labels = []
-    for method, own in zip(methods, settings, strict=True):
+    for method, map_name, own in zip(methods, maps, settings, strict=True):
         alike = [other for name, other in zip(methods, settings, strict=True) if name == method]
-        apart = [
-            f"{key} {own[key]}" for key in own if key != "map" and any(o[key] != own[key] for o in alike)
-        ]
-        labels.append(", ".join([*([own["map"]] if several_maps else []), method, *apart]))
+        apart = [f"{key} {own[key]}" for key in own if any(o[key] != own[key] for o in alike)]
+        labels.append(", ".join([map_name, method, *apart] if len(set(maps)) > 1 else [method, *apart]))
     return labels
 
 

@@ -155,8 +155,8 @@ class Targets(Game):
         return [mark, 1 - mark] + [1.0] * 10
 
     def play(self, actions: list[int]) -> float:
-        hits = np.array(actions) == self.marks[self.t]
-        return float(np.mean((np.array(actions) < self.targets) + hits.astype(float))) / self.episode_limit
+        shots, hits = np.less(actions, self.targets), np.equal(actions, self.marks[self.t])
+        return float(shots.mean() + hits.mean()) / self.episode_limit
 
 
 class Levers(Game):
@@ -230,10 +230,10 @@ def test_memory_beats_what_can_be_seen(name: str) -> None:
 @pytest.mark.parametrize("name", ["liir", "central_v", "iac"])
 def test_a_policy_that_has_learned_the_obvious_still_sees(name: str) -> None:
     """From a small head, learning what is good everywhere saturates the GRU, and the policy goes blind."""
-    small = FASTER | {"policy_hidden": 64}
-    player = train(Targets(), name, small, updates=40, epsilon=0.1, seed=1)
+    settings = FASTER | {"policy_hidden": 64}
+    player = train(Targets(), name, settings, updates=40, epsilon=0.1, seed=1)
     assert mean_return(player, Exploration.GREEDY, episodes=64) > 1.9
-    player = train(Targets(), name, small | {"policy_gain": 0.01}, updates=40, epsilon=0.1, seed=1)
+    player = train(Targets(), name, settings | {"policy_gain": 0.01}, updates=40, epsilon=0.1, seed=1)
     assert mean_return(player, Exploration.GREEDY, episodes=64) < 1.6
 
 

@@ -282,7 +282,9 @@ def test_a_saturated_policy_is_seen_in_its_hidden_std(method: str) -> None:
     algorithm = make(method)
     assert algorithm.update(batch_of(0))["policy_hidden_std"] > 0.03
     state = algorithm.state()
-    views(state["policy.parameters"], policy_shapes(SPEC, 8))["gru.bias_ih"].fill_(50)
+    _, z, n = views(state["policy.parameters"], policy_shapes(SPEC, 8))["gru.bias_ih"].chunk(3)
+    z.fill_(-50)
+    n.fill_(50)  # h = tanh(n) from the first step on
     algorithm.load_state(state)
     assert algorithm.update(batch_of(1))["policy_hidden_std"] < 0.001
 

@@ -93,17 +93,6 @@ def test_the_papers_comparison_has_its_budgets_and_controls() -> None:
     assert {key for key, value in of["liir"].items() if of["frozen_eta"][key] != value} == {"freeze_eta"}
 
 
-def test_the_short_comparison_is_a_part_of_the_papers_with_smaller_budgets() -> None:
-    short = plan(ROOT / "configs" / "figure3-short.yaml")
-    methods = {run.method for run in short}
-    full = {run.name: run.config for run in plan(ROOT / "configs" / "figure3.yaml", methods=sorted(methods))}
-    assert len(short) == len(methods) * 4 * 3
-    for run in short:
-        of_full = full[run.name]
-        assert (run.config.env, run.config.algorithm) == (of_full.env, of_full.algorithm)
-        assert run.config.training.total_env_steps < of_full.training.total_env_steps
-
-
 def test_figure_2_trains_five_seeds_and_an_untrained_control() -> None:
     runs = plan(ROOT / "configs" / "figure2.yaml")
     assert {(run.method, run.seed) for run in runs} == {

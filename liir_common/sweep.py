@@ -1,7 +1,8 @@
 """`liir sweep`: methods × maps × seeds from one YAML file, each run a `liir train` process with a directory
 of its own.
 
-What is finished is skipped, what was interrupted goes on, so the same command again completes a sweep.
+What is finished is skipped, what was interrupted goes on, so the same command again completes a sweep; with
+more environment steps it continues the runs that are there.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
+from operator import getitem
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -36,8 +38,8 @@ _FREE_PORTS = {
     "actors": {"metrics_port": 0},
     "evaluation": {"metrics_port": 0},
 }
-_WHERE_IT_RUNS = ("actors", "learner")
-"""Sections that a run takes anew when it goes on, maybe on another machine."""
+_TAKEN_ANEW = ("actors", "learner", "training.total_env_steps")
+"""What a run takes anew when it goes on: where it runs, maybe another machine, and how far."""
 
 
 class SweepConfig(Section):
@@ -205,8 +207,9 @@ class Sweep:
     def _command(self, run: Run, resumed: bool) -> list[str]:
         tree, config = run.config.tree(), self._output / "configs" / f"{run.name}.yaml"
         write_atomic(config, yaml.safe_dump(tree, sort_keys=False).encode())
-        where = [part for key in _WHERE_IT_RUNS for part in ("--set", f"{key}={json.dumps(tree[key])}")]
-        source = ["--resume", *where] if resumed else ["--config", str(config)]
+        anew = {key: json.dumps(reduce(getitem, key.split("."), tree)) for key in _TAKEN_ANEW}
+        settings = [part for key, value in anew.items() for part in ("--set", f"{key}={value}")]
+        source = ["--resume", *settings] if resumed else ["--config", str(config)]
         return [
             sys.executable,
             "-m",
@@ -234,12 +237,16 @@ class Sweep:
         _say(f"{run.name} {status}" + (f" with code {code}; see {outcome.log}" if status == "failed" else ""))
 
     def _write(self) -> None:
-        """Gather every run of the plan that has begun, whenever it ran."""
+        """Gather every run of the plan that has begun, whenever it ran, beside the sweep's other parts."""
         begun = [run for run in self._runs if (self._output / run.name / "run.json").exists()]
         rows = [row for run in begun for row in results.rows(self._output / run.name, run.method)]
-        write_atomic(self._output / "results.csv", csv_text(rows, results.COLUMNS).encode())
-        runs = [self._row(run) for run in self._runs]
-        write_atomic(self._output / "runs.csv", csv_text(runs).encode())
+        self._replace_rows("results.csv", rows, results.COLUMNS)
+        self._replace_rows("runs.csv", [self._row(run) for run in self._runs])
+
+    def _replace_rows(self, name: str, rows: list[dict[str, Any]], columns: Sequence[str] = ()) -> None:
+        planned = {run.name for run in self._runs}
+        others = [row for row in read_table(self._output / name) if row["run"] not in planned]
+        write_atomic(self._output / name, csv_text([*others, *rows], columns).encode())
 
     def _row(self, run: Run) -> dict[str, Any]:
         ended = {outcome.name: outcome.status for outcome in self._outcomes}.get(run.name)
@@ -272,6 +279,7 @@ class Sweep:
             for section, values in wanted.items()
             for key, value in values.items()
             if there[section].get(key) != value
+            and not (key == "total_env_steps" and value > there[section][key])  # goes on
         ]
         if differ:
             raise ConfigError(

@@ -67,3 +67,10 @@ def test_a_sweep_goes_on_where_it_was_and_one_failure_stops_nothing(tmp_path: Pa
 
     output = finish(start(*command, "--maps", "3m"))
     assert "3m-liir-seed1 skipped" in output
+
+    output = finish(start(*command, "--maps", "3m", "--set", "training.total_env_steps=7000"))
+    assert "3m-liir-seed1 goes on" in output
+    assert statuses(tmp_path / "out") == {"3m-liir-seed1": "complete", "nowhere-liir-seed1": "failed"}
+    assert int(read_table(tmp_path / "out" / "runs.csv")[-1]["env_steps"]) >= 7000
+    more = read_table(tmp_path / "out" / "results.csv")
+    assert [row["greedy_wins"] for row in more[: len(rows)]] == [row["greedy_wins"] for row in rows]

@@ -133,3 +133,11 @@ def test_a_run_with_other_settings_is_never_mixed_in(sweep: Path, tmp_path: Path
     make_run(folder, "algorithm.entropy=0.5", "algorithm.gamma=0.9", episodes=())
     with pytest.raises(ConfigError, match=r"other settings \(algorithm\.entropy: 0\.5 there, 0\.02 wanted\)"):
         Sweep(runs, tmp_path / "out")
+
+
+def test_only_a_larger_budget_belongs_to_a_run_that_is_there(sweep: Path, tmp_path: Path) -> None:
+    settings = ["algorithm.entropy=0.02", "algorithm.gamma=0.9"]
+    make_run(tmp_path / "out/3m-liir-seed1", *settings, "training.total_env_steps=1000", episodes=())
+    Sweep(plan(sweep, ["liir"], ["3m"], [1], ["training.total_env_steps=1001"]), tmp_path / "out")
+    with pytest.raises(ConfigError, match=r"training\.total_env_steps: 1000 there, 999 wanted"):
+        Sweep(plan(sweep, ["liir"], ["3m"], [1], ["training.total_env_steps=999"]), tmp_path / "out")

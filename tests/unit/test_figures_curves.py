@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from liir_common.errors import ConfigError
-from liir_common.figures.curves import mean_curve, points, tabulate, write_figure
+from liir_common.figures.curves import markdown, mean_curve, points, tabulate, write_figure
 from liir_common.files import csv_text, read_table
 from liir_common.results import COLUMNS, config_digest, read_curves, rows
 from tests.trained import add_evaluations, make_run
@@ -58,6 +58,19 @@ def test_best_is_not_final(tmp_path: Path) -> None:
     run = add_evaluations(make_run(tmp_path / "a", episodes=()), [20] * 10 + [0] * 10)
     (row,) = tabulate(read_curves([run]))
     assert (row.best, row.final) == pytest.approx((1, 0))
+
+
+def test_the_goal_is_reached_by_ten_evaluations_together(tmp_path: Path) -> None:
+    """Eight of ten at 100 % and two at 50 % are 90 %; nine evaluations say nothing yet."""
+    found = [
+        add_evaluations(make_run(tmp_path / "a", "seed=1", episodes=()), [0, 10, 10] + [20] * 8),
+        add_evaluations(make_run(tmp_path / "b", "seed=2", episodes=()), [20] * 9),
+    ]
+    (row,) = tabulate(read_curves(found))
+    assert row.goal_env_steps == (11_000,)
+    assert markdown([row]).endswith("| 11,000 (1 of 2) |\n")
+    (row,) = tabulate(read_curves(found[1:]))
+    assert markdown([row]).endswith("| – (0 of 1) |\n")
 
 
 def test_the_mean_ends_where_the_first_seed_does(tmp_path: Path) -> None:

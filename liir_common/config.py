@@ -133,7 +133,10 @@ class AlgorithmConfig(Section):
     """K policy steps per batch; the meta-gradient goes through the last."""
     critic_epochs: int = Field(4, ge=1)
     ratio_clip: float = Field(0.2, gt=0)
-    """Clip of the importance ratio in policy steps; a single step per batch truncates it at 1 instead."""
+    """PPO's clip of the importance ratio ρ in policy steps, where a batch gives several."""
+    ratio_bound: float = Field(0.0, ge=0)
+    """ρ is truncated here in v of Eq. (8), and in the policy step where a batch gives one; 0 is no bound, as
+    the paper has it. `training.lag: 1`, whose samples are old, sets 1."""
     entropy: float = Field(0.03, ge=0)
     orthogonal_init: bool = True
     policy_gain: float = Field(3.0, gt=0)
@@ -323,6 +326,8 @@ class Config(BaseSettings):
         preset = str(data.get("preset", "strong"))
         filled = PRESETS.get(preset, {})
         of_method = METHOD_PRESETS.get(_named(data, "algorithm", "name"), {}) if preset != "none" else {}
+        if _named(data, "training", "lag") == "1":
+            of_method = of_method | {"ratio_bound": 1.0}
         if _named(data, "env", "kind") == "pettingzoo":
             # Its options are SMAC's, which no other game takes.
             filled = {section: values for section, values in filled.items() if section != "env"}

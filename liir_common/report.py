@@ -142,7 +142,7 @@ def plot_win_rate(groups: dict[str, list[Path]], output: Path) -> None:
             for actions, alpha in (("greedy", 1.0), ("sampled", 0.35)):
                 rates = [float(row[f"{actions}_win_rate"]) for row in tests]
                 name = label if run_dir is run_dirs[0] and actions == "greedy" else None
-                axes.plot(steps, _smooth(rates), color=f"C{number}", label=name, alpha=alpha)
+                axes.plot(steps, smooth(rates), color=f"C{number}", label=name, alpha=alpha)
     axes.set(xlabel="environment steps", ylabel="win rate", ylim=(-0.02, 1.02))
     axes.axhline(_LEVEL, color="grey", lw=0.8, ls=":")
     axes.grid(alpha=0.25)
@@ -153,8 +153,8 @@ def plot_win_rate(groups: dict[str, list[Path]], output: Path) -> None:
     figure.savefig(output, dpi=120)
 
 
-def _smooth(values: list[float], window: int = 5) -> list[float]:
-    """Mean of each value and those before it in the window."""
+def smooth(values: Sequence[float], window: int = 5) -> list[float]:
+    """Mean of each value and those before it in the window, at the start of fewer."""
     return [
         sum(part) / len(part) for i in range(len(values)) if (part := values[max(0, i + 1 - window) : i + 1])
     ]

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+from bisect import bisect_right
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -82,6 +83,13 @@ class Curve:
     def rates(self) -> list[float]:
         """Greedy win rates."""
         return [wins / episodes for wins, episodes in zip(self.wins, self.episodes, strict=True)]
+
+    def until(self, env_steps: int) -> Curve:
+        """The same up to there, and at least its first evaluation."""
+        end = max(1, bisect_right(self.env_steps, env_steps))
+        return replace(
+            self, env_steps=self.env_steps[:end], wins=self.wins[:end], episodes=self.episodes[:end]
+        )
 
 
 def read_curves(sources: Sequence[Path]) -> list[Curve]:

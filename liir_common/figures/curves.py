@@ -11,24 +11,23 @@ import numpy as np
 
 from liir_common.figures.statistics import Interval, Values, bootstrap, wilson
 from liir_common.files import csv_text, write_atomic
+from liir_common.report import smooth
 from liir_common.results import Curve
 
 _WINDOW = 10
 """Evaluations that a level is the mean of: one alone jumps between 0 and 1."""
 _GOAL = 0.9
-_SMOOTH = 5
 _POINTS = 200
 
 
 @dataclass(frozen=True)
 class Row:
-    """One method on one map; win rates are greedy, means over seeds."""
+    """One method on one map as far as every seed has come; win rates are greedy, means over seeds."""
 
     map: str
     method: str
     seeds: int
     env_steps: int
-    """That every seed has come to"""
     final: float
     """Of the last ten evaluations"""
     final_seeds: Interval | None
@@ -79,6 +78,8 @@ def tabulate(curves: Sequence[Curve]) -> list[Row]:
 
 
 def _row(map_name: str, method: str, runs: Sequence[Curve]) -> Row:
+    env_steps = min(run.env_steps[-1] for run in runs)
+    runs = [run.until(env_steps) for run in runs]
     final = [float(np.mean(run.rates[-_WINDOW:])) for run in runs]
     best = [float(_means(run.rates, _WINDOW).max()) for run in runs]
     wins = sum(sum(run.wins[-_WINDOW:]) for run in runs)
@@ -87,7 +88,7 @@ def _row(map_name: str, method: str, runs: Sequence[Curve]) -> Row:
         map_name,
         method,
         len(runs),
-        min(run.env_steps[-1] for run in runs),
+        env_steps,
         float(np.mean(final)),
         bootstrap(final),
         wilson(wins, episodes),
@@ -154,10 +155,7 @@ def mean_curve(runs: Sequence[Curve]) -> tuple[Values, Values, Values]:
     seed has come; each seed's is the mean of five evaluations, interpolated."""
     first = max(run.env_steps[0] for run in runs)
     grid = np.linspace(first, max(first, min(run.env_steps[-1] for run in runs)), _POINTS)
-    rates = []
-    for run in runs:
-        means = _means(run.rates, _SMOOTH)
-        rates.append(np.interp(grid, run.env_steps[-len(means) :], means))
+    rates = [np.interp(grid, run.env_steps, smooth(run.rates)) for run in runs]
     return grid, np.mean(rates, 0), np.std(rates, 0, ddof=1 if len(runs) > 1 else 0)
 
 

@@ -49,7 +49,8 @@ def wilson(wins: int, episodes: int) -> Interval:
     rate, z2 = wins / episodes, _Z**2
     centre = (rate + z2 / (2 * episodes)) / (1 + z2 / episodes)
     half = _Z / (1 + z2 / episodes) * math.sqrt(rate * (1 - rate) / episodes + z2 / (4 * episodes**2))
-    return centre - half, centre + half
+    # Rounding would leave the range where all or none are won.
+    return max(0.0, centre - half), min(1.0, centre + half)
 
 
 def bootstrap(values: Sequence[float]) -> Interval | None:

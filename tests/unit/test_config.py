@@ -175,6 +175,15 @@ def test_every_shipped_configuration_loads() -> None:
         config.load(file)
 
 
+@pytest.mark.parametrize("preset", ["strong", "paper", "none"])
+def test_only_old_samples_have_their_ratio_truncated(preset: str) -> None:
+    settings = [f"preset={preset}"]
+    assert config.load(settings=settings).algorithm.ratio_bound == 0
+    assert config.load(settings=[*settings, "training.lag=1"]).algorithm.ratio_bound == 1
+    chosen = config.load(settings=[*settings, "training.lag=1", "algorithm.ratio_bound=2"])
+    assert chosen.algorithm.ratio_bound == 2
+
+
 def test_a_kept_tree_is_all_there_is(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("LIIR_TRAINING__LAG", "1")
     assert config.from_tree({"seed": 2}).training.lag == 0

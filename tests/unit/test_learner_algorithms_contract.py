@@ -269,7 +269,8 @@ def test_divergence_is_an_error(method: str) -> None:
 def test_a_single_step_on_its_own_episodes_clips_nothing() -> None:
     """The actors' kernel and the learner's products round differently, which is no clipping."""
     player = make_player(EnvConfig(map="3m"))
-    config = AlgorithmConfig.model_validate({"name": "central_v", "policy_epochs": 1})
+    settings = {"name": "central_v", "policy_epochs": 1, "ratio_bound": 1.0}
+    config = AlgorithmConfig.model_validate(settings)
     algorithm = make_algorithm(player.spec, config, 5, CPU)
     player.load(algorithm.policy())
     tickets = [Ticket.for_training(1, i, 0, config.behaviour, epsilon=0.1) for i in range(8)]

@@ -37,6 +37,8 @@ CASES: dict[str, dict[str, object]] = {
     "targets": {"target_interval": 3, "gae_lambda": 0.8},
     "bootstrap": {"limit_is_terminal": False, "normalize_values": False},
     "default init": {"orthogonal_init": False},
+    "old samples": {"policy_epochs": 1, "ratio_bound": 1.1},
+    "old samples, two steps": {"policy_epochs": 2, "ratio_bound": 1.0},
 }
 
 
@@ -45,13 +47,16 @@ def config_of(case: dict[str, object]) -> AlgorithmConfig:
 
 
 def batch_of(seed: int, version: int = 0) -> Batch:
-    """Padding, deaths, a gap in a life, truncation, and a behaviour policy that is not the learner's."""
+    """Padding, deaths, a gap in a life, a behaviour policy that is not the learner's, and episodes that end
+    by the limit, by themselves, and by both at once."""
     batch = synthetic_batch(SPEC, episodes=6, steps=6, seed=seed, policy_version=version, epsilon=0.2)
     noise = np.random.default_rng(seed).normal(0, 0.3, batch.log_mu.shape).astype(np.float32)
     alive = batch.alive.copy()
     assert alive[0, :3, 0].all()
     alive[0, 1, 0] = False
-    return replace(batch, alive=alive, log_mu=batch.log_mu + noise)
+    truncated, ended = batch.truncated.copy(), np.argmax(batch.terminated.any(1))
+    truncated[ended] |= batch.terminated[ended]
+    return replace(batch, alive=alive, truncated=truncated, log_mu=batch.log_mu + noise)
 
 
 @dataclass
@@ -225,7 +230,7 @@ def policy_gradient(theta: Tensor, a: Tensor, batch: Batch, config: AlgorithmCon
     log_pi = log_pi_of(pi, batch)
     rho = (log_pi - t64(batch.log_mu)).exp()
     if config.policy_epochs == 1:
-        surrogate = torch.where(rho < 1, rho, rho / rho.detach()) * a
+        surrogate = truncated(rho, config) * a
     else:
         low, high = 1 - config.ratio_clip, 1 + config.ratio_clip
         surrogate = torch.minimum(rho * a, rho.clamp(low, high) * a)
@@ -235,12 +240,18 @@ def policy_gradient(theta: Tensor, a: Tensor, batch: Batch, config: AlgorithmCon
 
 
 def outer_objective(theta: Tensor, batch: Batch, a_ex: Tensor, config: AlgorithmConfig) -> Tensor:
-    """J with ∇J = (1/N) Σ w · min(ρ, 1) · A_ex · ∇log π."""
+    """J with ∇J = (1/N) Σ w · ρ · A_ex · ∇log π."""
     w, n = weights_of(batch)
     rho = (
         log_pi_of(policy_probabilities(theta, batch, config.policy_hidden), batch) - t64(batch.log_mu)
     ).exp()
-    return (w * a_ex * torch.where(rho < 1, rho, 1 + rho.log())).sum() / n
+    return (w * a_ex * truncated(rho, config)).sum() / n
+
+
+def truncated(rho: Tensor, config: AlgorithmConfig) -> Tensor:
+    """What has min(ρ, bound) · ∇log π for its gradient."""
+    bound = config.ratio_bound
+    return torch.where(rho < bound, rho, bound * (1 + (rho / bound).log())) if bound else rho
 
 
 def inner_steps(eta: Tensor, state: State, batch: Batch, config: AlgorithmConfig) -> tuple[Tensor, Tensor]:
@@ -325,7 +336,7 @@ def test_update_equals_differentiating_through_the_inner_step(case: str) -> None
     close(after["phi.parameters"], fitted(before, "phi", wanted.proxy_return, batch, config), 1e-12)
     close(after["varphi.parameters"], fitted(before, "varphi", wanted.extrinsic_return, batch, config), 1e-12)
     # The case has to exercise what it is there for.
-    assert metrics["clip_fraction"] > 0.01
+    assert (metrics["clip_fraction"] > 0.01) == (config.policy_epochs > 1 or config.ratio_bound > 0)
     assert (metrics["policy_gradient_norm"] > config.policy_optimizer.clip) == (
         config.policy_optimizer.clip < 1
     )

@@ -1,20 +1,17 @@
 """Plans of sweeps: which runs, with which settings, and what belongs to a run that is there already."""
 
 from pathlib import Path
-from typing import get_args
 
 import pytest
 import yaml
 
-from liir_common import results
-from liir_common.config import AlgorithmConfig
+from liir_common import config, results
 from liir_common.errors import ConfigError
 from liir_common.files import Table
 from liir_common.sweep import Sweep, is_complete, plan
 from tests.trained import add_evaluations, make_run
 
 ROOT = Path(__file__).parents[2]
-METHODS = get_args(AlgorithmConfig.model_fields["name"].annotation)
 SWEEP = {
     "base": {"preset": "strong", "algorithm": {"entropy": 0.02, "gamma": 0.9}},
     "maps": {"3m": {}, "8m": {"training": {"total_env_steps": 500}, "algorithm": {"gamma": 0.95}}},
@@ -78,12 +75,13 @@ def test_the_papers_comparison_has_its_budgets_and_controls() -> None:
         "central_v",
         "coma",
         "qmix",
+        "vdn",
         "lambda0",
         "frozen_eta",
+        "liir_paper",
     }
-    known = [name for name in tree["methods"] if name in (*METHODS, "lambda0", "frozen_eta")]
-    runs = plan(path, methods=known)
-    assert len(runs) == len(known) * 4 * 5
+    runs = plan(path)
+    assert len(runs) == 10 * 4 * 5
     budgets = {run.map: run.config.training.total_env_steps for run in runs}
     assert budgets == {"3m": 3_000_000, "8m": 3_000_000, "2s3z": 10_000_000, "3s5z": 10_000_000}
     # A comparison compares the method: between a control and LIIR one setting differs.
@@ -91,6 +89,13 @@ def test_the_papers_comparison_has_its_budgets_and_controls() -> None:
     changed = {key for key, value in of["liir"].items() if of["lambda0"][key] != value}
     assert changed == {"lambda_"}
     assert {key for key, value in of["liir"].items() if of["frozen_eta"][key] != value} == {"freeze_eta"}
+    released = config.load(settings=["preset=paper"])
+    for run in runs:
+        if run.method == "liir_paper":
+            assert (run.config.algorithm, run.config.env.options) == (
+                released.algorithm,
+                released.env.options,
+            )
 
 
 def test_figure_2_trains_five_seeds_and_an_untrained_control() -> None:

@@ -45,9 +45,9 @@ class Policy:
     The behaviour policy is π = (1 - ε)·softmax + ε / available actions, and so is the π of every
     log-probability, ratio and derivative here, with the batch's ε.
 
-    Correction of old samples: the ratio is always ρ = π_θ / μ with the stored probability μ, whether θ
-    has moved on by earlier steps on the batch or the actors' policy was a version behind. With one step
-    per batch it is truncated at 1; with several, steps use PPO's clip (Schulman et al., 2017).
+    The ratio is always ρ = π_θ / μ with the stored probability μ, whether θ has moved on by steps on the
+    batch or the actors' policy was a version behind; `ratio_bound` truncates it. Where a batch gives several
+    policy steps, they use PPO's clip instead (Schulman et al., 2017).
     """
 
     def __init__(
@@ -94,17 +94,21 @@ class Policy:
         )
 
     def extrinsic_gradient(self, data: Data, advantage: Tensor) -> Tensor:
-        """v = (1/N) Σ w · ρ · A · ∇log π at the present θ [P]; ρ is truncated at 1, `advantage` A is [R]."""
+        """v = (1/N) Σ w · ρ · A · ∇log π at the present θ [P]; `advantage` A is [R]."""
         now = self.evaluate(self.theta, data)
-        rho = (now.log_pi - data.log_mu).exp().clamp(max=1)
-        return self._backward(now, self._score(now, data, rho * advantage))
+        return self._backward(now, self._score(now, data, self._ratio(now, data) * advantage))
+
+    def _ratio(self, at: Evaluation, data: Data) -> Tensor:
+        """ρ = π / μ [R], truncated where the samples may be old."""
+        rho = (at.log_pi - data.log_mu).exp()
+        bound = self._config.ratio_bound
+        return rho.clamp(max=bound) if bound else rho
 
     def score_weight(self, at: Evaluation, data: Data, advantage: Tensor) -> Tensor:
         """What ∇log π is weighted with in a policy step [R]: the advantage [R] times the corrected ratio."""
-        rho = (at.log_pi - data.log_mu).exp()
         if self._config.policy_epochs == 1:
-            return rho.clamp(max=1) * advantage
-        clip = self._config.ratio_clip
+            return self._ratio(at, data) * advantage
+        rho, clip = (at.log_pi - data.log_mu).exp(), self._config.ratio_clip
         beyond = torch.where(advantage > 0, rho > 1 + clip, rho < 1 - clip)
         return (rho * advantage).masked_fill(beyond, 0)
 

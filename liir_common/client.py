@@ -32,6 +32,7 @@ from liir_common.rpc.tokens import Role
 
 AWAY = (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.DEADLINE_EXCEEDED)
 """Codes that tell of the connection, not of the call: to try again may help."""
+_ERRORS = {grpc.StatusCode.NOT_FOUND: MissingError, grpc.StatusCode.DATA_LOSS: CorruptError}
 _PAGE = 1000
 _DOWNLOAD_TRIES = 5
 """In a row that brought nothing; then a download is given up."""
@@ -206,7 +207,7 @@ class CheckpointClient:
                 return self._append_rest(episode, file)
             except grpc.RpcError as error:
                 if error.code() not in AWAY:
-                    kind = MissingError if error.code() == grpc.StatusCode.NOT_FOUND else LiirError
+                    kind = _ERRORS.get(error.code(), LiirError)
                     raise kind(f"checkpoint {episode}: {error.details()}") from None
             if file.tell() > begin:
                 failures, waits = 0, backoffs()

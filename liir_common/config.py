@@ -7,6 +7,7 @@ tree, which the run directory keeps and a resumed run reads back.
 from __future__ import annotations
 
 import difflib
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -423,12 +424,21 @@ def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     return out
 
 
+def leaves(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """The values of a tree under their dotted keys."""
+    flat: dict[str, Any] = {}
+    for key, value in tree.items():
+        flat |= leaves(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+    return flat
+
+
 def load(path: Path | None = None, settings: Sequence[str] = ()) -> Config:
     """Read a YAML file and lay `key.sub=value` settings over it.
 
     Raises:
         ConfigError: the file is missing or not YAML, a key is unknown, a value has the wrong type.
     """
+    _check_environment()
     try:
         sources: dict[str, Any] = parse_settings(settings) | {"_file": _read(path) if path else {}}
         return Config(**sources)
@@ -438,6 +448,16 @@ def load(path: Path | None = None, settings: Sequence[str] = ()) -> Config:
         raise ConfigError(
             f"the environment has a section that is not JSON ({error}); set its keys, as in LIIR_ENV__MAP=8m"
         ) from None
+
+
+def _check_environment() -> None:
+    """Refuse misspelt variables, of which pydantic takes no notice."""
+    known = {f"LIIR_{name}".upper() for name in Config.model_fields} | {"LIIR_TOKENS"}
+    for name in os.environ:
+        if name.upper().startswith("LIIR_") and name.upper().split("__")[0] not in known:
+            close = difflib.get_close_matches(name.upper().split("__")[0], known, n=1)
+            hint = f"did you mean {close[0]}?" if close else f"known: {', '.join(sorted(known))}"
+            raise ConfigError(f"the environment has the unknown variable {name}; {hint}")
 
 
 def from_tree(tree: Mapping[str, Any]) -> Config:
@@ -461,8 +481,9 @@ def _read(path: Path) -> dict[str, Any]:
         raise ConfigError(f"{path} is not YAML: {error}") from None
     if tree is None:
         return {}
-    if not isinstance(tree, dict):
-        raise ConfigError(f"{path}: wanted a mapping of settings, got {type(tree).__name__}")
+    if not isinstance(tree, dict) or not all(isinstance(key, str) for key in tree):
+        got = f"keys {list(tree)}" if isinstance(tree, dict) else type(tree).__name__
+        raise ConfigError(f"{path}: wanted a mapping of settings by name, got {got}")
     return _spelled_out(tree)
 
 
@@ -508,7 +529,7 @@ def parse_settings(settings: Sequence[str]) -> dict[str, Any]:
     tree: dict[str, Any] = {}
     for setting in settings:
         key, equals, text = setting.partition("=")
-        if not equals or not key:
+        if not equals or not key or key.startswith("_"):
             raise ConfigError(f"--set wants key.sub=value, got {setting!r}")
         try:
             value = yaml.safe_load(text)

@@ -27,6 +27,7 @@ from liir_common.config import Config, SecurityConfig
 from liir_common.display import Display, make_display, phase_name
 from liir_common.errors import (
     ConfigError,
+    CorruptError,
     LiirError,
     RefusedError,
     StorageError,
@@ -44,10 +45,12 @@ _POLL_S = 0.25
 _START_S = 120.0
 _STOP_S = 60.0
 END_S = 10.0
+_HOME_S = 10.0
+"""For which actors and evaluator, sent home by a learner that ends, may be gone before it."""
 _RESTARTS, _RESTARTS_WITHIN_S = 3, 300.0
 _PR_SET_PDEATHSIG = 1
 _LAST_LINES, _LAST_BYTES = 5, 65_536
-_IN_VAIN = (ConfigError.exit_code, RefusedError.exit_code, StorageError.exit_code)
+_IN_VAIN = tuple(kind.exit_code for kind in (ConfigError, CorruptError, RefusedError, StorageError))
 """Codes of processes that would only end in the same way again."""
 _EVENT = re.compile(r'"event": "([^"]*)"')
 _EXCEPTION = re.compile(r"^(?:error: |[\w.]*(?:Error|Exception)\b).*$", re.MULTILINE)
@@ -201,6 +204,7 @@ class Launcher:
         self._evaluator = evaluator
         self._security = security
         self._stop_signal = 0
+        self._gone_since: dict[str, float] = {}
 
     def run(self, evaluate: bool) -> None:
         """Train until the run is complete or a signal asks to stop.
@@ -290,13 +294,19 @@ class Launcher:
         """Start again what died; the run goes on as if nothing had happened."""
         for service in (self._learner, self._actors, self._evaluator):
             code = service.exit_code
-            if code in (None, 0):
+            if code is None or (code == 0 and not self._left_early(service)):
                 continue
             if code in _IN_VAIN or not service.may_restart():
                 self._raise_death(service)
             log.error("a process died; it is started again", reason=service.obituary())
             service.phase = ""
             service.start()
+            self._gone_since.pop(service.name, None)
+
+    def _left_early(self, service: Service) -> bool:
+        """Whether one that ended in peace is missed: the learner, which sends the others home, goes on."""
+        gone = time.monotonic() - self._gone_since.setdefault(service.name, time.monotonic())
+        return service is not self._learner and self._learner.exit_code is None and gone > _HOME_S
 
     def _stop(self, training: TrainingClient) -> None:
         try:
@@ -353,8 +363,9 @@ def train(
     with storage_explained(run_dir):
         summary = write_report(run_dir)
     print_summary(run_dir, summary)
-    if launcher.stop_signal:
+    if summary.env_steps < config.training.total_env_steps or launcher.stop_signal:
         print(f"stopped early; go on with: {command} --resume --run-dir {run_dir}", file=sys.stderr)
+    if launcher.stop_signal:
         raise SystemExit(128 + launcher.stop_signal)
 
 

@@ -41,6 +41,19 @@ def load_security(file: Path | None, settings: list[str] | None) -> SecurityConf
     return config.load(file, settings or ()).security
 
 
+_MAY_CHANGE = (
+    "actors",
+    "checkpoints",
+    "evaluation",
+    "learner",
+    "metrics",
+    "security",
+    "training.save_interval",
+    "training.total_env_steps",
+)
+"""Where a run goes on, how far, and what is kept of it; what it learns stays as it began."""
+
+
 def load_run_config(
     file: Path | None, settings: list[str] | None, run_dir: Path | None, resume: bool
 ) -> Config:
@@ -48,14 +61,30 @@ def load_run_config(
 
     Raises:
         ConfigError: there is a run and `resume` is false, or the other way round, or the configuration
-            cannot be used.
+            cannot be used, or a resumed run would go on with what it did not begin with.
     """
     if run_dir is not None:
         _check_run_dir(run_dir, resume)
     if not resume or run_dir is None:
         return config.load(file, settings or ())
     kept = yaml.safe_load((run_dir / "config.yaml").read_text(encoding="utf-8"))
-    return config.from_tree(config.merge(kept, config.parse_settings(settings or ())))
+    resumed = config.from_tree(config.merge(kept, config.parse_settings(settings or ())))
+    _check_same_run(config.from_tree(kept), resumed, run_dir)
+    return resumed
+
+
+def _check_same_run(kept: Config, resumed: Config, run_dir: Path) -> None:
+    before, after = (config.leaves(each.tree()) for each in (kept, resumed))
+    changed = [
+        f"{key}: {before.get(key)!r} there, {after.get(key)!r} wanted"
+        for key in before | after
+        if before.get(key) != after.get(key) and not key.startswith(_MAY_CHANGE)
+    ]
+    if changed:
+        raise ConfigError(
+            f"{run_dir} was begun with other settings ({'; '.join(changed)}); a resumed run may change only "
+            f"{', '.join(_MAY_CHANGE)}; leave the others out, or begin another run"
+        )
 
 
 def holds_run(run_dir: Path) -> bool:

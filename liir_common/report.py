@@ -10,6 +10,7 @@ from typing import Any
 
 import yaml
 
+from liir_common.config import leaves
 from liir_common.files import csv_text, read_table, write_atomic
 
 _LEVEL = 0.9
@@ -113,20 +114,13 @@ def curve_labels(configs: Sequence[Mapping[str, Any]]) -> list[str]:
     """The method of each, its map where there are several, and its differences from others of that method."""
     methods = [method_label(config["algorithm"]) for config in configs]
     maps = [config["env"]["map"] for config in configs]
-    settings = [_leaves(config["algorithm"]) for config in configs]
+    settings = [leaves(config["algorithm"]) for config in configs]
     labels = []
     for method, map_name, own in zip(methods, maps, settings, strict=True):
         alike = [other for name, other in zip(methods, settings, strict=True) if name == method]
         apart = [f"{key} {own[key]}" for key in own if any(o[key] != own[key] for o in alike)]
         labels.append(", ".join([map_name, method, *apart] if len(set(maps)) > 1 else [method, *apart]))
     return labels
-
-
-def _leaves(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in tree.items():
-        flat |= _leaves(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
-    return flat
 
 
 def plot_win_rate(groups: dict[str, list[Path]], output: Path) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 from liir_common.battle.parameters import resolve
 from liir_common.battle.tables import FIRST_ATTACK, Battle, Tables, build_battle, build_tables
 from liir_common.battle.terrain import TERRAINS
+from liir_common.errors import ConfigError
 
 
 @dataclass(frozen=True)
@@ -198,10 +199,10 @@ def find_scenario(map_name: str) -> Scenario:
     """The scenario of that name.
 
     Raises:
-        ValueError: there is none; the message lists those that there are.
+        ConfigError: there is none; the message lists those that there are.
     """
     if map_name not in SCENARIOS:
-        raise ValueError(f"unknown map {map_name!r}; known: {', '.join(SCENARIOS)}")
+        raise ConfigError(f"unknown map {map_name!r}; known: {', '.join(SCENARIOS)}")
     return SCENARIOS[map_name]
 
 

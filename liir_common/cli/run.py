@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from liir_common import options
-from liir_common.errors import UnreachableError
+from liir_common.errors import ConfigError, UnreachableError
 
 app = typer.Typer()
 _PASS_ON = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
@@ -26,6 +26,10 @@ def train(
     """Train on this machine: a learner, Ray actors and an evaluator, until the run is complete."""
     from liir_common import launch, logs
 
+    if resume and config is not None:
+        raise ConfigError(
+            "--config begins a run, and --resume keeps the configuration it was begun with; leave one out"
+        )
     logs.configure("train")
     launch.train("liir train", launch.local, config, settings or (), run_dir, resume)
 

@@ -78,7 +78,8 @@ class CheckpointService(checkpoint_pb2_grpc.CheckpointServiceServicer):
         try:
             data = self._run.checkpoints.read(manifest)
         except (CorruptError, OSError) as error:
-            raise Refused(grpc.StatusCode.DATA_LOSS, f"checkpoint {request.episode}: {error}") from None
+            message = f"{error}; restore the file from a backup, or remove it and its manifest"
+            raise Refused(grpc.StatusCode.DATA_LOSS, message) from None
         if request.offset > len(data):
             raise ValueError(f"offset: wanted 0..{len(data)}, got {request.offset}")
         header = checkpoint_pb2.CheckpointHeader(

@@ -209,7 +209,7 @@ class RolloutService(rollout_pb2_grpc.RolloutServiceServicer):
                 if request.HasField("hello"):
                     raise ValueError("hello: wanted in the first message alone, got another")
                 self._handle(request, stream)
-        except (Refused, ValueError) as error:
+        except Exception as error:
             stream.end(error)
         finally:
             stream.end()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import signal
-from collections.abc import Awaitable
+from collections.abc import Awaitable, Callable
 
 import structlog
 import torch
@@ -54,11 +54,13 @@ async def serve(config: Config, run: RunDirectory, spec: EnvSpec) -> None:
     with storage_explained(run.path):
         run.write_parameters(algorithm.parameter_counts())
 
+    on_loop = _OnLoop(loop)
+
     def publish(opening: Opening, weights: Weights) -> None:
-        loop.call_soon_threadsafe(rollouts.publish, opening, weights)
+        on_loop(lambda: rollouts.publish(opening, weights))
 
     def frozen() -> None:
-        asyncio.run_coroutine_threadsafe(checkpoints.changed(), loop)
+        on_loop(checkpoints.changed)
 
     with storage_explained(run.path):
         trainer = Trainer(run, algorithm, publish, frozen)
@@ -87,13 +89,34 @@ async def serve(config: Config, run: RunDirectory, spec: EnvSpec) -> None:
     log.info("serving", address=f"{config.learner.host}:{server.port}", run=str(run.path))
     expiry = asyncio.create_task(rollouts.expire_tickets())
     try:
-        await _first_of(asyncio.to_thread(trainer.run), expiry)
+        await _first_of(asyncio.to_thread(trainer.run), expiry, on_loop.failure)
         if trainer.complete and config.evaluation.enabled and not stopping.is_set():
             trainer.progress.phase = training_pb2.PHASE_EVALUATING
-            await _first_of(checkpoints.wait_all_evaluated(), stopping.wait(), expiry)
+            await _first_of(checkpoints.wait_all_evaluated(), stopping.wait(), expiry, on_loop.failure)
     finally:
+        trainer.stop()
         expiry.cancel()
         await _leave(server, trainer, rollouts, checkpoints)
+
+
+class _OnLoop:
+    """Work that another thread leaves to the event loop without waiting for it."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        self._loop = loop
+        self.failure: asyncio.Future[None] = loop.create_future()
+        """Ends with the first exception of such work, which nobody else would notice."""
+
+    def __call__(self, work: Callable[[], Awaitable[None] | None]) -> None:
+        asyncio.run_coroutine_threadsafe(self._run(work), self._loop)
+
+    async def _run(self, work: Callable[[], Awaitable[None] | None]) -> None:
+        try:
+            if (rest := work()) is not None:
+                await rest
+        except Exception as error:
+            if not self.failure.done():
+                self.failure.set_exception(error)
 
 
 async def _leave(

@@ -21,7 +21,7 @@ from torch import Tensor
 from liir_common import metrics
 from liir_common.build import git_commit
 from liir_common.checkpoint import Manifest, pack
-from liir_common.errors import DiskFullError, storage_explained
+from liir_common.errors import CorruptError, DiskFullError, storage_explained
 from liir_common.rpc.gen.liir.v1 import training_pb2
 from liir_common.types import Batch, Trajectory, Weights
 from services.learner.algorithms import Algorithm
@@ -50,11 +50,13 @@ class Progress:
 
     @property
     def env_steps_per_second(self) -> float:
-        """Rate over the last learner steps."""
+        """Rate over the last learner steps, and over the time that the next is late."""
         if len(self.recent) < 2:
             return 0.0
         (t0, n0), (t1, n1) = self.recent[0], self.recent[-1]
-        return (n1 - n0) / (t1 - t0)
+        usual = (t1 - t0) / (len(self.recent) - 1)
+        late = max(0.0, time.monotonic() - t1 - usual)
+        return (n1 - n0) / (t1 - t0 + late)
 
 
 class Trainer:
@@ -280,7 +282,13 @@ class Trainer:
                 self._openings.append((Opening(batch, 0, epsilon), self.algorithm.policy()))
         else:
             _, tensors, notes = saved
-            self.algorithm.load_state(_section(tensors, "algorithm."))
+            try:
+                self.algorithm.load_state(_section(tensors, "algorithm."))
+            except ValueError as error:
+                raise CorruptError(
+                    f"the state of step {counters.learner_step} fits no {self.config.algorithm.name} of this "
+                    f"build: {error}; resume with the build that wrote it"
+                ) from None
             for fields in notes["openings"]:
                 weights = _section(tensors, f"opening.{fields['batch']}.")
                 numpy_weights = {name: tensor.numpy() for name, tensor in weights.items()}

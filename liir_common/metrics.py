@@ -75,6 +75,7 @@ RPC_ERRORS = LEARNER.counter("liir_rpc_errors_total", "Calls refused, by status 
 CHECKPOINTS = LEARNER.gauge("liir_checkpoints", "Checkpoints frozen")
 CHECKPOINT_TIME = LEARNER.gauge("liir_checkpoint_timestamp_seconds", "Unix time of the newest checkpoint")
 CHECKPOINTS_DELETED = LEARNER.gauge("liir_checkpoints_deleted", "Checkpoints deleted since, of those frozen")
+CHECKPOINTS_DAMAGED = LEARNER.gauge("liir_checkpoints_damaged", "Checkpoints found damaged, and not tested")
 EVALUATIONS = LEARNER.gauge("liir_evaluations", "Checkpoints tested")
 WIN_RATE = LEARNER.gauge("liir_win_rate", "Wins / episodes of the newest test, 0 to 1", ["map", "actions"])
 EVALUATION_RETURN = LEARNER.gauge(

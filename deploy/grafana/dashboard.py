@@ -224,6 +224,7 @@ def build() -> dashboard.Dashboard:
                 ("liir_checkpoints", "frozen"),
                 ("liir_evaluations", "tested"),
                 ("liir_checkpoints_deleted", "deleted"),
+                ("liir_checkpoints_damaged", "damaged"),
             ).min(0),
             series(
                 "Evaluator's position",

@@ -26,6 +26,8 @@ from liir_common.rpc.tokens import Role
 log = structlog.get_logger()
 
 _RETRIED = (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.CANCELLED)
+_MOST_REFUSALS = 3
+"""Of what was sent, with nothing taken in between: a damaged message is an accident, three are a fault."""
 
 
 class RolloutActor:
@@ -53,6 +55,7 @@ class RolloutActor:
         self._shapes = types.policy_shapes(self._player.spec, config.algorithm.policy_hidden)
         self._version = -1
         """Of the policy that this stream brought last."""
+        self._refusals = 0
         self._idle_since = 0.0
 
     def ready(self) -> str:
@@ -75,11 +78,24 @@ class RolloutActor:
                         return
                     waits = channel.backoffs()
                 except grpc.RpcError as error:
-                    if error.code() not in _RETRIED:
-                        raise RefusedError(f"{error.code().name}: {error.details()}") from None
-                    log.warning("the learner is away", address=self._address, reason=error.details())
+                    self._judge(error)
                 # Nothing to keep: whoever gets the tickets next plays the same episodes.
                 time.sleep(next(waits))
+
+    def _judge(self, error: grpc.RpcError) -> None:
+        """Return if another stream may do better.
+
+        Raises:
+            RefusedError: it will not.
+        """
+        refused = error.code() == grpc.StatusCode.INVALID_ARGUMENT
+        self._refusals += refused
+        if error.code() not in _RETRIED and not (refused and self._refusals < _MOST_REFUSALS):
+            raise RefusedError(f"{error.code().name}: {error.details()}") from None
+        if refused:
+            log.error("the learner refused what this actor sent", reason=error.details())
+        else:
+            log.warning("the learner is away", address=self._address, reason=error.details())
 
     def _serve(self, learner: rollout_pb2_grpc.RolloutServiceStub) -> bool:
         """Play over one stream until it ends; true if the run is complete."""
@@ -99,6 +115,8 @@ class RolloutActor:
         self._version = -1
         self._idle_since = time.perf_counter()
         for message in messages:
+            if message.acks:
+                self._refusals = 0
             if message.HasField("policy"):
                 self._player.load(codec.decode_policy(message.policy, self._shapes))
                 self._version = message.policy.version

@@ -11,7 +11,7 @@ import structlog
 from liir_common import checkpoint, metrics, seeds
 from liir_common.client import AWAY, CheckpointClient
 from liir_common.config import Config
-from liir_common.errors import MissingError, RefusedError, UnreachableError
+from liir_common.errors import CorruptError, MissingError, RefusedError, UnreachableError
 from liir_common.rollout.player import Player
 from liir_common.rpc.channel import backoffs
 from liir_common.rpc.gen.liir.v1 import checkpoint_pb2
@@ -87,6 +87,8 @@ class Evaluator:
             except MissingError as error:
                 # Only tested ones are ever deleted: another evaluator was quicker.
                 log.info("not tested", episode=frozen.episode, reason=str(error))
+            except CorruptError as error:
+                log.error("not tested", episode=frozen.episode, reason=str(error))
             else:
                 metrics.EVALUATED_EPISODE.set(frozen.episode)
 

@@ -34,6 +34,8 @@ class CheckpointService(checkpoint_pb2_grpc.CheckpointServiceServicer):
         self._changed = asyncio.Condition()
         self._ended = False
         self._complete = False
+        self._damaged: set[int] = set()
+        """Episodes of checkpoints whose files cannot be read, so that no test of them will ever come."""
         self.evaluations = {
             evaluation.episode: evaluation for evaluation in map(_from_row, run.evaluations.read())
         }
@@ -42,8 +44,9 @@ class CheckpointService(checkpoint_pb2_grpc.CheckpointServiceServicer):
 
     @property
     def all_evaluated(self) -> bool:
-        """Whether every checkpoint so far has its test."""
-        return all(manifest.episode in self.evaluations for manifest in self._run.checkpoints.manifests)
+        """Whether every checkpoint so far that can be read has its test."""
+        done = self.evaluations.keys() | self._damaged
+        return all(manifest.episode in done for manifest in self._run.checkpoints.manifests)
 
     async def changed(self) -> None:
         """Wake the watchers: there is a new checkpoint or a new evaluation; older ones may go."""
@@ -78,7 +81,8 @@ class CheckpointService(checkpoint_pb2_grpc.CheckpointServiceServicer):
         try:
             data = self._run.checkpoints.read(manifest)
         except (CorruptError, OSError) as error:
-            message = f"{error}; restore the file from a backup, or remove it and its manifest"
+            await self._note_damage(request.episode)
+            message = f"{error}; restore its file from a backup"
             raise Refused(grpc.StatusCode.DATA_LOSS, message) from None
         if request.offset > len(data):
             raise ValueError(f"offset: wanted 0..{len(data)}, got {request.offset}")
@@ -138,6 +142,12 @@ class CheckpointService(checkpoint_pb2_grpc.CheckpointServiceServicer):
         return checkpoint_pb2.ListEvaluationsResponse(
             evaluations=[self.evaluations[episode] for episode in episodes[: _limit(request.limit)]]
         )
+
+    async def _note_damage(self, episode: int) -> None:
+        self._damaged.add(episode)
+        metrics.CHECKPOINTS_DAMAGED.set(len(self._damaged))
+        log.error("a checkpoint is damaged; it is neither served nor tested", episode=episode)
+        await self.changed()
 
     def _find(self, episode: int) -> Manifest:
         try:
@@ -199,10 +209,8 @@ def _check(evaluation: checkpoint_pb2.Evaluation, manifest: Manifest, info_keys:
         if not 0 <= stats.wins <= stats.episodes or stats.episodes == 0:
             raise ValueError(f"{name}: wanted 0 <= wins <= episodes > 0, got {stats.wins}/{stats.episodes}")
         # Each becomes a column of a table.
-        if not set(stats.info_means) <= set(info_keys):
-            raise ValueError(
-                f"{name}: wanted info of {sorted(info_keys)}, got {len(stats.info_means)} others"
-            )
+        if set(stats.info_means) != set(info_keys):
+            raise ValueError(f"{name}: wanted info of {sorted(info_keys)}, got {sorted(stats.info_means)}")
         if not all(map(math.isfinite, (stats.return_mean, stats.length_mean, *stats.info_means.values()))):
             raise ValueError(f"{name}: wanted finite means, got NaN or infinity")
 

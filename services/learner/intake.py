@@ -113,16 +113,17 @@ class Intake:
         episode = trajectory.episode_id
         if episode >= self._opened:
             raise ValueError(f"episode {episode} was never ordered; the last ticket was {self._opened - 1}")
-        if self._held[actor].pop(episode, None) is not None:
-            self.ask(actor, 1)
         ticket = self._unplayed.get(episode)
-        if ticket is None:
-            return False
-        if trajectory.policy_version != ticket.policy_version:
+        if ticket is not None and trajectory.policy_version != ticket.policy_version:
+            # The actor keeps its ticket, so that leaving gives it to another.
             raise ValueError(
                 f"episode {episode}: wanted policy version {ticket.policy_version}, "
                 f"got {trajectory.policy_version}"
             )
+        if self._held[actor].pop(episode, None) is not None:
+            self.ask(actor, 1)
+        if ticket is None:
+            return False
         del self._unplayed[episode]
         self._played[episode] = trajectory
         self._deliver_complete()

@@ -12,7 +12,8 @@ import signal
 import subprocess
 import time
 import urllib.request
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import psutil
@@ -173,9 +174,9 @@ def test_resuming_a_complete_run_ends_well(undisturbed: Path) -> None:
     assert service.digests(undisturbed) == before
 
 
-def test_the_evaluator_may_be_away_and_catches_up(undisturbed: Path, tmp_path: Path) -> None:
-    """Learner and actors alone, to the end of training; then an evaluator comes."""
-    run_dir = tmp_path / "run"
+@contextmanager
+def trained_and_not_tested(run_dir: Path, checkpoints: int) -> Iterator[str]:
+    """Learner and actors alone, to the end of training; yields the learner's address, then all must end."""
     learner = service.start("learner", "--run-dir", str(run_dir), *service.arguments([]))
     actors = None
     try:
@@ -183,16 +184,54 @@ def test_the_evaluator_may_be_away_and_catches_up(undisturbed: Path, tmp_path: P
         address = service.endpoints(run_dir)["address"]
         actors = service.start("actors", "--learner", address)
         with service.client(run_dir) as training:
-            frozen = len(service.digests(undisturbed))
-            service.wait_for(lambda: training.status().checkpoints == frozen, "the last checkpoint")
+            service.wait_for(lambda: training.status().checkpoints == checkpoints, "the last checkpoint")
             assert training.status().evaluations == 0
-        service.finish(service.start("evaluator", "--learner", address))
+        yield address
         service.finish(learner)
         service.finish(actors)
     finally:
         for process in (learner, actors):
             if process is not None and process.poll() is None:
                 process.kill()
+
+
+def test_the_evaluator_may_be_away_and_catches_up(undisturbed: Path, tmp_path: Path) -> None:
+    run_dir = tmp_path / "run"
+    with trained_and_not_tested(run_dir, len(service.digests(undisturbed))) as address:
+        service.finish(service.start("evaluator", "--learner", address))
+    assert_same(run_dir, undisturbed)
+
+
+def test_a_damaged_checkpoint_is_not_tested_and_stops_nothing(undisturbed: Path, tmp_path: Path) -> None:
+    run_dir, episodes = tmp_path / "run", list(service.digests(undisturbed))
+    with trained_and_not_tested(run_dir, len(episodes)) as address:
+        weights = run_dir / "checkpoints" / f"checkpoint-{episodes[1]:09d}.safetensors"
+        data = bytearray(weights.read_bytes())
+        data[-1] ^= 1
+        weights.write_bytes(data)
+        service.finish(service.start("evaluator", "--learner", address))
+    tested = [int(row["episode"]) for row in csv.DictReader((run_dir / "evaluations.csv").open())]
+    assert tested == [episode for episode in episodes if episode != episodes[1]]
+
+
+def leave_driver(process: subprocess.Popen[str]) -> None:
+    service.descendants(process, "services.actor")[0].terminate()
+
+
+def leave_evaluator(process: subprocess.Popen[str]) -> None:
+    service.descendants(process, "services.evaluator")[0].terminate()
+
+
+@pytest.mark.parametrize("leave", [leave_driver, leave_evaluator])
+def test_a_part_that_was_asked_to_end_is_started_again(
+    leave: Callable[[subprocess.Popen[str]], None], undisturbed: Path, tmp_path: Path
+) -> None:
+    """They end with 0 then, as they do at the end of a run."""
+    run_dir = tmp_path / "run"
+    with service.training(run_dir) as process:
+        service.wait_for(lambda: service.learner_step(run_dir) >= 5, "the fifth learner step")
+        leave(process)
+        service.finish(process)
     assert_same(run_dir, undisturbed)
 
 

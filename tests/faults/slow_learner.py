@@ -6,7 +6,7 @@ Measured in CPU time of the thread that learns (`learner.threads: 1`), so that a
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from liir_common import options
@@ -21,10 +21,10 @@ def make_slow_algorithm(*arguments: Any) -> Any:
     algorithm = _make_algorithm(*arguments)
     update, warm = algorithm.update, False
 
-    def slow_update(batch: Batch) -> Mapping[str, float]:
+    def slow_update(batch: Batch, policy_ready: Callable[[], None]) -> Mapping[str, float]:
         nonlocal warm
         begin = time.thread_time()
-        figures = update(batch)
+        figures = update(batch, policy_ready)
         if warm:
             time.sleep((SLOWER - 1) * (time.thread_time() - begin))
         warm = True

@@ -202,6 +202,10 @@ def wrong_shape(message: rollout_pb2.Trajectory) -> None:
     message.obs.shape[1] += 1
 
 
+def other_version(message: rollout_pb2.Trajectory) -> None:
+    message.policy_version += 1
+
+
 def no_action(message: rollout_pb2.Trajectory) -> None:
     message.mask.data = bytes(len(message.mask.data))
 
@@ -213,6 +217,7 @@ def no_action(message: rollout_pb2.Trajectory) -> None:
         (never_ordered, "episode 999 was never ordered"),
         (wrong_shape, "obs: wanted float32"),
         (no_action, "no available action"),
+        (other_version, "wanted policy version 0, got 1"),
     ],
 )
 def test_a_bad_trajectory_ends_its_stream_and_nothing_else(
@@ -287,7 +292,8 @@ def test_evaluations_are_stored_once(learner: tuple[str, Path]) -> None:
     play_batches(address, 2)
     with CheckpointClient(address) as client:
         frozen = next(client.watch())
-        stats = checkpoint_pb2.EpisodeStats(episodes=4, wins=3, return_mean=1.5, info_means={"won": 0.75})
+        means = {"won": 0.75, "dead_allies": 1.0, "dead_enemies": 2.0}
+        stats = checkpoint_pb2.EpisodeStats(episodes=4, wins=3, return_mean=1.5, info_means=means)
         evaluation = checkpoint_pb2.Evaluation(
             episode=6, sha256=frozen.sha256, env_steps=frozen.env_steps, greedy=stats, sampled=stats
         )
@@ -300,11 +306,17 @@ def test_evaluations_are_stored_once(learner: tuple[str, Path]) -> None:
         with pytest.raises(grpc.RpcError) as caught:
             client.report(wrong)
         assert caught.value.code() == grpc.StatusCode.INVALID_ARGUMENT
+        stats.info_means.pop("dead_allies")
+        partial = checkpoint_pb2.Evaluation(episode=12, greedy=stats, sampled=stats)
+        partial.sha256 = client.find(12).sha256
+        with pytest.raises(grpc.RpcError, match="wanted info of"):
+            client.report(partial)
 
 
 def report(client: CheckpointClient, episode: int, wins: int, return_mean: float) -> None:
     frozen = client.find(episode)
-    stats = checkpoint_pb2.EpisodeStats(episodes=4, wins=wins, return_mean=return_mean)
+    means = dict.fromkeys(("won", "dead_allies", "dead_enemies"), 0.5)
+    stats = checkpoint_pb2.EpisodeStats(episodes=4, wins=wins, return_mean=return_mean, info_means=means)
     evaluation = checkpoint_pb2.Evaluation(
         episode=episode, sha256=frozen.sha256, env_steps=frozen.env_steps, greedy=stats, sampled=stats
     )

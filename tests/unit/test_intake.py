@@ -100,6 +100,20 @@ def test_tickets_of_an_actor_that_left_go_to_another_first() -> None:
     assert [ticket.episode_id for _, ticket in give(intake)] == [0, 1, 2, 3]
 
 
+def test_a_refused_episode_is_played_by_another() -> None:
+    intake, _ = make_intake()
+    for actor in "ab":
+        intake.join(actor)
+    intake.open(Opening(0, 0, 0.0))
+    intake.ask("a", 1)
+    give(intake)
+    with pytest.raises(ValueError, match="wanted policy version 0, got 1"):
+        intake.accept("a", make_trajectory(0, version=1))
+    assert intake.leave("a") == 1
+    intake.ask("b", 1)
+    assert [ticket.episode_id for _, ticket in give(intake)] == [0]
+
+
 def test_requests_of_an_actor_that_left_are_forgotten() -> None:
     intake, _ = make_intake()
     for actor in "ab":

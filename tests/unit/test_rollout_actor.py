@@ -1,0 +1,53 @@
+"""What an actor makes of refusals, from a server that only refuses."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from concurrent import futures
+from itertools import repeat
+
+import grpc
+import pytest
+
+from liir_common.config import Config
+from liir_common.errors import RefusedError
+from liir_common.rpc.gen.liir.v1 import rollout_pb2, rollout_pb2_grpc
+from services.actor.rollout_actor import RolloutActor
+
+
+class Refusing(rollout_pb2_grpc.RolloutServiceServicer):
+    """Each stream ends as the next letter says: r refused, a refused after an ack, c complete."""
+
+    def __init__(self, ends: str) -> None:
+        self.ends = iter(ends)
+
+    def Play(
+        self, requests: Iterator[rollout_pb2.PlayRequest], context: grpc.ServicerContext
+    ) -> Iterator[rollout_pb2.PlayResponse]:
+        end = next(self.ends)
+        if end == "a":
+            yield rollout_pb2.PlayResponse(acks=[rollout_pb2.Ack(episode_id=1)])
+        if end != "c":
+            context.abort(grpc.StatusCode.INVALID_ARGUMENT, "reward: wanted finite")
+        yield rollout_pb2.PlayResponse(drain=rollout_pb2.Drain(run_complete=True))
+
+
+def play(ends: str, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Let an actor play until it ends; returns the letters that are left."""
+    monkeypatch.setattr("services.actor.rollout_actor.channel.backoffs", lambda: repeat(0.0))
+    server, learner = grpc.server(futures.ThreadPoolExecutor(2)), Refusing(ends)
+    rollout_pb2_grpc.add_RolloutServiceServicer_to_server(learner, server)
+    port = server.add_insecure_port("127.0.0.1:0")
+    server.start()
+    try:
+        RolloutActor("a", 1, f"127.0.0.1:{port}", Config().tree(), {}).run()
+    finally:
+        server.stop(0).wait()
+    return "".join(learner.ends)
+
+
+def test_a_refusal_is_an_accident_and_three_in_a_row_are_a_fault(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert play("rrc", monkeypatch) == ""
+    assert play("rrarc", monkeypatch) == "", "an ack begins the count anew"
+    with pytest.raises(RefusedError, match="INVALID_ARGUMENT: reward: wanted finite"):
+        play("rrrc", monkeypatch)

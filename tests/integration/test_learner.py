@@ -287,40 +287,34 @@ def test_checkpoints_are_listed_watched_and_fetched(learner: tuple[str, Path], t
             client.get(7)
 
 
+def evaluation_of(
+    frozen: checkpoint_pb2.Checkpoint, wins: int = 0, return_mean: float = 0.0
+) -> checkpoint_pb2.Evaluation:
+    means = {"won": wins / 4, "dead_allies": 1.0, "dead_enemies": 2.0}
+    stats = checkpoint_pb2.EpisodeStats(episodes=4, wins=wins, return_mean=return_mean, info_means=means)
+    return checkpoint_pb2.Evaluation(
+        episode=frozen.episode, sha256=frozen.sha256, env_steps=frozen.env_steps, greedy=stats, sampled=stats
+    )
+
+
 def test_evaluations_are_stored_once(learner: tuple[str, Path]) -> None:
     address, run_dir = learner
     play_batches(address, 2)
     with CheckpointClient(address) as client:
         frozen = next(client.watch())
-        means = {"won": 0.75, "dead_allies": 1.0, "dead_enemies": 2.0}
-        stats = checkpoint_pb2.EpisodeStats(episodes=4, wins=3, return_mean=1.5, info_means=means)
-        evaluation = checkpoint_pb2.Evaluation(
-            episode=6, sha256=frozen.sha256, env_steps=frozen.env_steps, greedy=stats, sampled=stats
-        )
+        evaluation, partial, wrong = (evaluation_of(frozen, wins=3) for _ in range(3))
+        del partial.greedy.info_means["won"]  # which would leave a cell of the table empty
+        with pytest.raises(grpc.RpcError, match="greedy: wanted info of"):
+            client.report(partial)
         assert client.report(evaluation)
         assert not client.report(evaluation)
         assert list(client.evaluations()) == [evaluation]
         rows = (run_dir / "evaluations.csv").read_text().splitlines()
         assert len(rows) == 2
-        wrong = checkpoint_pb2.Evaluation(episode=6, sha256="0", greedy=stats, sampled=stats)
+        wrong.sha256 = "0"
         with pytest.raises(grpc.RpcError) as caught:
             client.report(wrong)
         assert caught.value.code() == grpc.StatusCode.INVALID_ARGUMENT
-        stats.info_means.pop("dead_allies")
-        partial = checkpoint_pb2.Evaluation(episode=12, greedy=stats, sampled=stats)
-        partial.sha256 = client.find(12).sha256
-        with pytest.raises(grpc.RpcError, match="wanted info of"):
-            client.report(partial)
-
-
-def report(client: CheckpointClient, episode: int, wins: int, return_mean: float) -> None:
-    frozen = client.find(episode)
-    means = dict.fromkeys(("won", "dead_allies", "dead_enemies"), 0.5)
-    stats = checkpoint_pb2.EpisodeStats(episodes=4, wins=wins, return_mean=return_mean, info_means=means)
-    evaluation = checkpoint_pb2.Evaluation(
-        episode=episode, sha256=frozen.sha256, env_steps=frozen.env_steps, greedy=stats, sampled=stats
-    )
-    assert client.report(evaluation)
 
 
 def test_the_commands_list_watch_rank_and_fetch(learner: tuple[str, Path], tmp_path: Path) -> None:
@@ -336,7 +330,7 @@ def test_the_commands_list_watch_rank_and_fetch(learner: tuple[str, Path], tmp_p
         with pytest.raises(LiirError, match="no checkpoint has been tested yet"):
             checkpoints("best")
         for episode, wins, return_mean in ((6, 3, 9.0), (12, 3, 10.0), (18, 2, 20.0)):
-            report(client, episode, wins, return_mean)
+            assert client.report(evaluation_of(client.find(episode), wins, return_mean))
         best = client.best()
         sha256_of = {frozen.episode: frozen.sha256 for frozen in client.list()}
     assert best.episode == 12
@@ -377,13 +371,6 @@ def test_grpcurl_needs_no_proto_files(learner: tuple[str, Path]) -> None:
     assert header["header"]["checkpoint"] == listed
     stored = (run_dir / "checkpoints" / "checkpoint-000000006.safetensors").read_bytes()
     assert b"".join(base64.b64decode(message["chunk"]) for message in chunks) == stored[10:]
-
-
-def evaluation_of(frozen: checkpoint_pb2.Checkpoint) -> checkpoint_pb2.Evaluation:
-    stats = checkpoint_pb2.EpisodeStats(episodes=4, wins=0)
-    return checkpoint_pb2.Evaluation(
-        episode=frozen.episode, sha256=frozen.sha256, env_steps=frozen.env_steps, greedy=stats, sampled=stats
-    )
 
 
 @pytest.mark.parametrize("learner", [("checkpoints.keep_newest=1", "checkpoints.keep_best=0")], indirect=True)

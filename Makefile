@@ -24,7 +24,7 @@ setup: $(VENV)/.installed ## Create .venv with the pinned requirements
 train: setup ## Train LIIR on 3m (ARGS="--set seed=7" adds settings)
 	$(BIN)/liir train --config configs/3m.yaml $(ARGS)
 
-test: setup browser ## Run every test
+test: setup browser ## Run the tests that need no containers, no root and no Prometheus
 	$(BIN)/pytest $(ARGS)
 
 # From the system where root may, else the build that playwright downloads.
@@ -91,6 +91,7 @@ proto: setup ## Generate the gRPC code from proto/
 
 proto-check: proto
 	git diff --exit-code -- $(GEN)
+	test -z "$$(git ls-files --others -- $(GEN) | grep -v __pycache__)"
 
 .PHONY: help setup train test browser fuzz test-monitoring test-compose test-ray-submit test-faults soak dashboard \
 	requirements lint proto proto-check

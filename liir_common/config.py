@@ -363,7 +363,7 @@ _RMSPROP = {"name": "rmsprop", "lr": 5e-4, "alpha": 0.99, "eps": 1e-5, "clip": 1
 PRESETS: Mapping[str, dict[str, Any]] = {
     # What makes the method learn fast; the defaults of the models above are this preset.
     "strong": {"env": {"options": {"reward_only_positive": True, "state_last_action": False}}},
-    # The released configuration: one plain step a batch, no normalisation, negative rewards.
+    # Much as released: one plain step a batch, no normalisation, own losses count.
     "paper": {
         "env": {"options": {"reward_only_positive": False, "state_last_action": False}},
         "algorithm": {

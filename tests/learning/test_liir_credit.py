@@ -1,4 +1,4 @@
-"""LIIR finds out whose action earned the team's reward: three players, three levers each.
+"""LIIR finds out which action of each player earns the team's reward: three players, three levers each.
 
 Player 0's lever 0 earns the team 1 and its lever 2 costs it 1; player 1's levers are wired the other way
 round and player 2's not at all. The three share one policy and see nothing but who they are.

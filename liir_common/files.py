@@ -5,15 +5,19 @@ from __future__ import annotations
 import csv
 import errno
 import fcntl
+import hashlib
 import io
 import os
+import re
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from liir_common.errors import ConfigError
+from liir_common.errors import ConfigError, CorruptError
+
+_DIGEST_DIGITS = 16
 
 
 def write_atomic(path: Path, data: bytes, mode: int = 0o644) -> None:
@@ -29,6 +33,27 @@ def write_atomic(path: Path, data: bytes, mode: int = 0o644) -> None:
     except BaseException:
         os.unlink(temporary)
         raise
+
+
+def write_digested(path: Path, data: bytes) -> Path:
+    """`write_atomic` under a name that ends with the data's digest; returns that path."""
+    digest = hashlib.sha256(data).hexdigest()[:_DIGEST_DIGITS]
+    path = path.with_stem(f"{path.stem}-{digest}")
+    write_atomic(path, data)
+    return path
+
+
+def check_digest(path: Path) -> None:
+    """Compare a file with the digest in its name; one that was written before names had any passes.
+
+    Raises:
+        CorruptError: the bytes have another digest.
+    """
+    wanted = re.search(rf"-([0-9a-f]{{{_DIGEST_DIGITS}}})$", path.stem)
+    with path.open("rb") as file:
+        got = hashlib.file_digest(file, "sha256").hexdigest()
+    if wanted and not got.startswith(wanted[1]):
+        raise CorruptError(f"{path} is corrupt: its name says SHA-256 {wanted[1]}…, its bytes {got}")
 
 
 def remove_leftovers(directory: Path) -> None:

@@ -13,7 +13,7 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from liir_common.errors import ConfigError, CorruptError
 
@@ -78,6 +78,26 @@ def held(directory: Path) -> Iterator[None]:
                 f"another process works in {directory}; wait for its end, or name another --run-dir"
             ) from None
         yield
+
+
+@contextmanager
+def appended_alone(path: Path) -> Iterator[BinaryIO]:
+    """`path`, made if missing, open at its end; one at a time, and who comes later waits."""
+    while True:
+        with path.open("ab") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            # Whoever had it may have renamed or removed it meanwhile; then the name is free again.
+            if _is_named(file, path):
+                file.seek(0, os.SEEK_END)
+                yield file
+                return
+
+
+def _is_named(file: BinaryIO, path: Path) -> bool:
+    try:
+        return os.path.samefile(file.fileno(), path)
+    except FileNotFoundError:
+        return False
 
 
 class Table:

@@ -69,7 +69,7 @@ ACTOR_PLAY_SECONDS = LEARNER.counter("liir_actor_play_seconds_total", "Seconds a
 ACTOR_WAIT_SECONDS = LEARNER.counter("liir_actor_wait_seconds_total", "Seconds all actors waited for tickets")
 ACTOR_MEMORY = LEARNER.gauge("liir_actor_peak_memory_bytes", "Peak resident memory, connected actors' sum")
 DISK_FULL = LEARNER.gauge("liir_disk_full", "1 while the run waits for room on its disk")
-RPC_ERRORS = LEARNER.counter("liir_rpc_errors_total", "Calls refused, by status code", ["method", "code"])
+RPC_ERRORS = LEARNER.counter("liir_rpc_errors_total", "Calls that failed, by status code", ["method", "code"])
 
 # Learner: checkpoints and their tests.
 CHECKPOINTS = LEARNER.gauge("liir_checkpoints", "Checkpoints frozen")

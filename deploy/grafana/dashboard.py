@@ -255,7 +255,7 @@ def build() -> dashboard.Dashboard:
             ).min(0),
             series(
                 "RPC errors",
-                "Calls refused per second.",
+                "Calls that failed per second.",
                 "short",
                 (
                     "sum by (method, code) (rate(liir_rpc_errors_total[$__rate_interval])) or vector(0)",

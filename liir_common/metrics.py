@@ -76,6 +76,7 @@ CHECKPOINTS = LEARNER.gauge("liir_checkpoints", "Checkpoints frozen")
 CHECKPOINT_TIME = LEARNER.gauge("liir_checkpoint_timestamp_seconds", "Unix time of the newest checkpoint")
 CHECKPOINTS_DELETED = LEARNER.gauge("liir_checkpoints_deleted", "Checkpoints deleted since, of those frozen")
 EVALUATIONS = LEARNER.gauge("liir_evaluations", "Checkpoints tested")
+EVALUATION_ENABLED = LEARNER.gauge("liir_evaluation_enabled", "1 if checkpoints are to be tested")
 WIN_RATE = LEARNER.gauge("liir_win_rate", "Wins / episodes of the newest test, 0 to 1", ["map", "actions"])
 EVALUATION_RETURN = LEARNER.gauge(
     "liir_evaluation_return", "Mean extrinsic return of the newest test", ["map", "actions"]

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from liir_common import config
+from liir_common import config, metrics
 from liir_common.types import Weights
 from services.learner.algorithms import make_algorithm
 from services.learner.intake import Opening
@@ -148,3 +148,9 @@ def test_the_replay_on_disk_is_what_the_kept_states_need(tmp_path: Path) -> None
     assert again.trainer.next_batch == 10
     assert again.trainer.algorithm.replay is not None
     assert (again.trainer.algorithm.replay.first, again.trainer.algorithm.replay.total) == (30, 40)
+
+
+@pytest.mark.parametrize("enabled", [True, False])
+def test_a_run_says_whether_its_checkpoints_are_to_be_tested(tmp_path: Path, enabled: bool) -> None:
+    Played(tmp_path, 1, f"evaluation.enabled={enabled}")
+    assert metrics.LEARNER.get_sample_value("liir_evaluation_enabled") == enabled

@@ -111,9 +111,10 @@ class CheckpointStore:
         self._manifests: list[Manifest] = []
         for episode in sorted(kept):
             self._manifests.append(_sharing(self.read_manifest(episode), self._manifests))
-        names += [self._name_deleted(episode) for episode in _episodes(names, r"deleted-(\d+)\.json")]
         deleted = filter(None, (re.fullmatch(r"deleted-(\d+)-(\w+)\.json", name) for name in names))
         self._deleted = {int(match[1]): match[2] for match in deleted if int(match[1]) not in kept}
+        for episode in _episodes(names, r"deleted-(\d+)\.json") - kept:  # as older builds named them
+            self._deleted[episode] = self._read_manifest(f"{self._root}/deleted-{episode:09d}.json").sha256
         for episode in _episodes(names, r"checkpoint-(\d+)\.safetensors") & self._deleted.keys():
             self._fs.rm(self._weights_path(episode))  # who wanted to died before
 
@@ -157,7 +158,8 @@ class CheckpointStore:
             KeyError: there is no such checkpoint.
         """
         manifest = self.find(episode)
-        self._fs.mv(self._manifest_path(episode), f"{self._root}/{_deleted_name(manifest)}")
+        deleted_path = f"{self._root}/deleted-{episode:09d}-{manifest.sha256}.json"
+        self._fs.mv(self._manifest_path(episode), deleted_path)
         with self._lock:
             self._deleted[episode] = manifest.sha256
             self._manifests = [other for other in self._manifests if other.episode != episode]
@@ -206,23 +208,12 @@ class CheckpointStore:
     def _manifest_path(self, episode: int) -> str:
         return f"{self._root}/checkpoint-{episode:09d}.json"
 
-    def _name_deleted(self, episode: int) -> str:
-        """Give `deleted-EPISODE.json`, which has its name from an older build, its new one."""
-        path = f"{self._root}/deleted-{episode:09d}.json"
-        name = _deleted_name(self._read_manifest(path))
-        self._fs.mv(path, f"{self._root}/{name}")
-        return name
-
     def _write(self, path: str, data: bytes) -> None:
         if "file" in self._fs.protocol:
             write_atomic(Path(path), data)
         else:
             # Object stores show an object when it is complete.
             self._fs.pipe_file(path, data)
-
-
-def _deleted_name(manifest: Manifest) -> str:
-    return f"deleted-{manifest.episode:09d}-{manifest.sha256}.json"
 
 
 def _episodes(names: Iterable[str], form: str) -> set[int]:

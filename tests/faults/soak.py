@@ -37,6 +37,7 @@ PROCESSES = {
     "actor": "ray::RolloutActor",
 }
 EVERY_S = 2.0
+START_S = 600.0
 MOST_PER_HOUR = {"memory, MiB": 50.0, "descriptors": 20.0, "threads": 20.0, "streams": 20.0}
 """The learner does grow: with the evaluations, of which there are thousands an hour here."""
 CERTAIN = 3.0
@@ -68,9 +69,9 @@ def measure(run_dir: Path, minutes: float) -> tuple[Samples, int]:
     """
     samples: Samples = defaultdict(list)
     with service.training(run_dir, *SETTINGS) as training:
-        service.wait_for(lambda: service.learner_step(run_dir) > 0, "the first learner step")
+        service.wait_for(lambda: service.learner_step(run_dir) > 0, "the first learner step", START_S)
         with service.client(run_dir) as client:
-            service.wait_for(lambda: client.status().actors == ACTORS, "the last actor")
+            service.wait_for(lambda: client.status().actors == ACTORS, "the last actor", START_S)
             found = {
                 f"{name} {number}" if name == "actor" else name: process
                 for name, command in PROCESSES.items()

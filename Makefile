@@ -34,8 +34,10 @@ browser: setup ## Install Chromium, which the tests of the replay page want
 	then apt-get update -qq && apt-get install -y -qq --no-install-recommends chromium; \
 	else $(BIN)/playwright install chromium; fi
 
-fuzz: setup ## Damaged messages, 100 000 into the codec and 5 000 into a learner
+fuzz: setup ## Damaged messages, 100 000 into the codec and 5 000 into a learner; 100 000 more that coverage leads to
 	$(BIN)/python -m tests.security.fuzz_wire $(ARGS)
+	# atheris is there for Linux on x86-64 only.
+	$(BIN)/python -m tests.security.fuzz_coverage -runs=100000
 
 # Debian's package, unpacked and not installed, since an installed one starts a server.
 PROMETHEUS := $(CURDIR)/$(VENV)/prometheus

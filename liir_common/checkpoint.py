@@ -1,17 +1,19 @@
 """Frozen checkpoints: a weights file in safetensors and a manifest that names its SHA-256.
 
 The manifest is written last, so a checkpoint exists exactly when its manifest does. One that was deleted has
-its manifest under another name, so that a resumed run that comes to it again neither freezes it anew nor
-differs from it unnoticed. A store may be a folder or any URL that fsspec knows.
+its manifest under another name, `deleted-EPISODE-SHA256.json`, so that a resumed run that comes to it again
+neither freezes it anew nor differs from it unnoticed; the name says enough for that, and the file is not
+read. A store may be a folder or any URL that fsspec knows.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import re
 import threading
-from collections.abc import Collection, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -104,15 +106,16 @@ class CheckpointStore:
         self._fs, self._root = fsspec.core.url_to_fs(url)
         self._fs.makedirs(self._root, exist_ok=True)
         self._lock = threading.Lock()
-        names = {path.rpartition("/")[2] for path in self._fs.ls(self._root, detail=False)}
-        kept = _episodes(names, "checkpoint-", ".json")
-        self._manifests = [self.read_manifest(episode) for episode in kept]
-        self._deleted = {
-            episode: self._read_manifest(self._deleted_path(episode)).sha256
-            for episode in _episodes(names, "deleted-", ".json")
-            if episode not in kept
-        }
-        for episode in set(_episodes(names, "checkpoint-", ".safetensors")) & self._deleted.keys():
+        names = [path.rpartition("/")[2] for path in self._fs.ls(self._root, detail=False)]
+        kept = _episodes(names, r"checkpoint-(\d+)\.json")
+        self._manifests: list[Manifest] = []
+        for episode in sorted(kept):
+            self._manifests.append(_sharing(self.read_manifest(episode), self._manifests))
+        deleted = filter(None, (re.fullmatch(r"deleted-(\d+)-(\w+)\.json", name) for name in names))
+        self._deleted = {int(match[1]): match[2] for match in deleted if int(match[1]) not in kept}
+        for episode in _episodes(names, r"deleted-(\d+)\.json") - kept:  # as older builds named them
+            self._deleted[episode] = self._read_manifest(f"{self._root}/deleted-{episode:09d}.json").sha256
+        for episode in _episodes(names, r"checkpoint-(\d+)\.safetensors") & self._deleted.keys():
             self._fs.rm(self._weights_path(episode))  # who wanted to died before
 
     @property
@@ -155,7 +158,8 @@ class CheckpointStore:
             KeyError: there is no such checkpoint.
         """
         manifest = self.find(episode)
-        self._fs.mv(self._manifest_path(episode), self._deleted_path(episode))
+        deleted_path = f"{self._root}/deleted-{episode:09d}-{manifest.sha256}.json"
+        self._fs.mv(self._manifest_path(episode), deleted_path)
         with self._lock:
             self._deleted[episode] = manifest.sha256
             self._manifests = [other for other in self._manifests if other.episode != episode]
@@ -204,9 +208,6 @@ class CheckpointStore:
     def _manifest_path(self, episode: int) -> str:
         return f"{self._root}/checkpoint-{episode:09d}.json"
 
-    def _deleted_path(self, episode: int) -> str:
-        return f"{self._root}/deleted-{episode:09d}.json"
-
     def _write(self, path: str, data: bytes) -> None:
         if "file" in self._fs.protocol:
             write_atomic(Path(path), data)
@@ -215,7 +216,17 @@ class CheckpointStore:
             self._fs.pipe_file(path, data)
 
 
-def _episodes(names: Collection[str], prefix: str, suffix: str) -> list[int]:
-    """The numbers in the names of that form, ascending."""
-    found = (name for name in names if name.startswith(prefix) and name.endswith(suffix))
-    return sorted(int(name[len(prefix) : -len(suffix)]) for name in found)
+def _episodes(names: Iterable[str], form: str) -> set[int]:
+    """The numbers in the names of that form."""
+    found = (re.fullmatch(form, name) for name in names)
+    return {int(match[1]) for match in found if match}
+
+
+def _sharing(manifest: Manifest, others: Sequence[Manifest]) -> Manifest:
+    """The manifest, with what the newest other says alike: a run's configuration is in memory once."""
+    shared = {
+        name: getattr(others[-1], name)
+        for name in ("env_spec", "config")
+        if others and getattr(others[-1], name) == getattr(manifest, name)
+    }
+    return replace(manifest, **shared)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from liir_common.checkpoint import Manifest, unpack
 from liir_common.config import PLAINTEXT, Config, SecurityConfig, from_tree, merge, parse_settings
 from liir_common.errors import CorruptError, LiirError, MissingError, RefusedError, UnreachableError
-from liir_common.files import write_atomic
+from liir_common.files import appended_alone, write_atomic
 from liir_common.rpc.channel import DEADLINE_S, backoffs, connect
 from liir_common.rpc.gen.liir.v1 import (
     checkpoint_pb2,
@@ -111,27 +111,31 @@ class CheckpointClient:
     def save(self, episode: int, folder: Path) -> Path:
         """Download a checkpoint into `folder`, made if missing; returns the weights file.
 
-        What was cut, this process included, goes on where it was cut. A checkpoint is there when its
-        manifest is, which is written last. Raises what `download` raises.
+        What was cut, this process included, goes on where it was cut; while another process downloads the
+        same one to the same folder, this waits. A checkpoint is there when its manifest is, which is
+        written last. Raises what `download` raises.
         """
-        digest = self.find(episode).sha256
-        if not re.fullmatch("[0-9a-f]{64}", digest):
-            raise CorruptError(f"checkpoint {episode}: wanted a SHA-256 in hex, got {digest!r}")
+        frozen = self.find(episode)
+        if not re.fullmatch("[0-9a-f]{64}", frozen.sha256):
+            raise CorruptError(f"checkpoint {episode}: wanted a SHA-256 in hex, got {frozen.sha256!r}")
         folder.mkdir(parents=True, exist_ok=True)
         # Named by the digest: what another checkpoint of that name left is never gone on with.
-        part = folder / f".{digest}.part"
-        with part.open("ab") as file:
+        part = folder / f".{frozen.sha256}.part"
+        with appended_alone(part) as file:
+            if file.tell() > frozen.size_bytes:
+                file.seek(0)
+                file.truncate()
             manifest = self._fetch(episode, file)
             file.flush()
             os.fsync(file.fileno())
-        try:
-            unpack(part.read_bytes(), manifest.sha256)
-        except CorruptError:
-            part.unlink()
-            raise
-        weights = folder / f"checkpoint-{episode:09d}.safetensors"
-        part.replace(weights)
-        write_atomic(weights.with_suffix(".json"), manifest.to_json().encode())
+            try:
+                unpack(part.read_bytes(), manifest.sha256)
+            except CorruptError:
+                part.unlink()
+                raise
+            weights = folder / f"checkpoint-{episode:09d}.safetensors"
+            part.replace(weights)
+            write_atomic(weights.with_suffix(".json"), manifest.to_json().encode())
         return weights
 
     def get(self, episode: int) -> tuple[Manifest, dict[str, NDArray[np.float32]]]:

@@ -5,15 +5,19 @@ from __future__ import annotations
 import csv
 import errno
 import fcntl
+import hashlib
 import io
 import os
+import re
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
-from liir_common.errors import ConfigError
+from liir_common.errors import ConfigError, CorruptError
+
+_DIGEST_DIGITS = 16
 
 
 def write_atomic(path: Path, data: bytes, mode: int = 0o644) -> None:
@@ -29,6 +33,27 @@ def write_atomic(path: Path, data: bytes, mode: int = 0o644) -> None:
     except BaseException:
         os.unlink(temporary)
         raise
+
+
+def write_digested(path: Path, data: bytes) -> Path:
+    """`write_atomic` under a name that ends with the data's digest; returns that path."""
+    digest = hashlib.sha256(data).hexdigest()[:_DIGEST_DIGITS]
+    path = path.with_stem(f"{path.stem}-{digest}")
+    write_atomic(path, data)
+    return path
+
+
+def check_digest(path: Path) -> None:
+    """Compare a file with the digest in its name; one that was written before names had any passes.
+
+    Raises:
+        CorruptError: the bytes have another digest.
+    """
+    wanted = re.search(rf"-([0-9a-f]{{{_DIGEST_DIGITS}}})$", path.stem)
+    with path.open("rb") as file:
+        got = hashlib.file_digest(file, "sha256").hexdigest()
+    if wanted and not got.startswith(wanted[1]):
+        raise CorruptError(f"{path} is corrupt: its name says SHA-256 {wanted[1]}…, its bytes {got}")
 
 
 def remove_leftovers(directory: Path) -> None:
@@ -53,6 +78,26 @@ def held(directory: Path) -> Iterator[None]:
                 f"another process works in {directory}; wait for its end, or name another --run-dir"
             ) from None
         yield
+
+
+@contextmanager
+def appended_alone(path: Path) -> Iterator[BinaryIO]:
+    """`path`, made if missing, open at its end; one at a time, and who comes later waits."""
+    while True:
+        with path.open("ab") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            # Whoever had it may have renamed or removed it meanwhile; then the name is free again.
+            if _is_named(file, path):
+                file.seek(0, os.SEEK_END)
+                yield file
+                return
+
+
+def _is_named(file: BinaryIO, path: Path) -> bool:
+    try:
+        return os.path.samefile(file.fileno(), path)
+    except FileNotFoundError:
+        return False
 
 
 class Table:

@@ -69,7 +69,7 @@ ACTOR_PLAY_SECONDS = LEARNER.counter("liir_actor_play_seconds_total", "Seconds a
 ACTOR_WAIT_SECONDS = LEARNER.counter("liir_actor_wait_seconds_total", "Seconds all actors waited for tickets")
 ACTOR_MEMORY = LEARNER.gauge("liir_actor_peak_memory_bytes", "Peak resident memory, connected actors' sum")
 DISK_FULL = LEARNER.gauge("liir_disk_full", "1 while the run waits for room on its disk")
-RPC_ERRORS = LEARNER.counter("liir_rpc_errors_total", "Calls refused, by status code", ["method", "code"])
+RPC_ERRORS = LEARNER.counter("liir_rpc_errors_total", "Calls that failed, by status code", ["method", "code"])
 
 # Learner: checkpoints and their tests.
 CHECKPOINTS = LEARNER.gauge("liir_checkpoints", "Checkpoints frozen")
@@ -77,6 +77,7 @@ CHECKPOINT_TIME = LEARNER.gauge("liir_checkpoint_timestamp_seconds", "Unix time 
 CHECKPOINTS_DELETED = LEARNER.gauge("liir_checkpoints_deleted", "Checkpoints deleted since, of those frozen")
 CHECKPOINTS_DAMAGED = LEARNER.gauge("liir_checkpoints_damaged", "Checkpoints found damaged, and not tested")
 EVALUATIONS = LEARNER.gauge("liir_evaluations", "Checkpoints tested")
+EVALUATION_ENABLED = LEARNER.gauge("liir_evaluation_enabled", "1 if checkpoints are to be tested")
 WIN_RATE = LEARNER.gauge("liir_win_rate", "Wins / episodes of the newest test, 0 to 1", ["map", "actions"])
 EVALUATION_RETURN = LEARNER.gauge(
     "liir_evaluation_return", "Mean extrinsic return of the newest test", ["map", "actions"]

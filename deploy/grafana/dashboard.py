@@ -97,7 +97,12 @@ def build() -> dashboard.Dashboard:
             ),
             figure("Learner step", "Which is the policy version.", "short", "liir_learner_step"),
             figure("Checkpoint age", "Since the newest was frozen.", "s", "liir:checkpoint_age_seconds"),
-            figure("Evaluation backlog", "Checkpoints not yet tested.", "short", "liir:evaluation_backlog"),
+            figure(
+                "Evaluation backlog",
+                "Checkpoints that wait for their test.",
+                "short",
+                "liir:evaluation_backlog",
+            ),
         ],
         "Learning": [
             win_rate_against_steps(),
@@ -256,7 +261,7 @@ def build() -> dashboard.Dashboard:
             ).min(0),
             series(
                 "RPC errors",
-                "Calls refused per second.",
+                "Calls that failed per second.",
                 "short",
                 (
                     "sum by (method, code) (rate(liir_rpc_errors_total[$__rate_interval])) or vector(0)",

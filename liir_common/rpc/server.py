@@ -2,6 +2,7 @@
 
 import ipaddress
 from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
 from typing import Any
 
 import grpc
@@ -84,33 +85,39 @@ async def _decode_stream(requests: AsyncIterator[bytes], handler: Any) -> AsyncI
 
 def _guard_unary(inner: Callable[..., Awaitable[Any]], method: str) -> Callable[..., Awaitable[Any]]:
     async def guarded(request: Any, context: grpc.aio.ServicerContext) -> Any:
-        try:
+        async with _errors_mapped(context, method):
             return await inner(request, context)
-        except (Refused, ValueError) as error:
-            await _abort(context, error, method)
 
     return guarded
 
 
 def _guard_stream(inner: Callable[..., AsyncIterator[Any]], method: str) -> Callable[..., AsyncIterator[Any]]:
     async def guarded(request: Any, context: grpc.aio.ServicerContext) -> AsyncIterator[Any]:
-        try:
+        async with _errors_mapped(context, method):
             async for response in inner(request, context):
                 yield response
-        except (Refused, ValueError) as error:
-            await _abort(context, error, method)
 
     return guarded
 
 
-async def _abort(context: grpc.aio.ServicerContext, error: Exception, method: str) -> None:
-    code = error.code if isinstance(error, Refused) else grpc.StatusCode.INVALID_ARGUMENT
+@asynccontextmanager
+async def _errors_mapped(context: grpc.aio.ServicerContext, method: str) -> AsyncIterator[None]:
     # The caller chooses both: no label for every name made up, no status beyond what gRPC lets through.
     known = method if method in METHODS or method in PUBLIC else "unknown"
-    reason = str(error)[:_MAX_REASON]
-    metrics.RPC_ERRORS.labels(method=known, code=code.name).inc()
-    log.warning("refused a call", method=known, code=code.name, reason=reason, peer=context.peer())
-    await context.abort(code, reason)
+    try:
+        yield
+    except (Refused, ValueError) as error:
+        code = error.code if isinstance(error, Refused) else grpc.StatusCode.INVALID_ARGUMENT
+        reason = str(error)[:_MAX_REASON]
+        metrics.RPC_ERRORS.labels(method=known, code=code.name).inc()
+        log.warning("refused a call", method=known, code=code.name, reason=reason, peer=context.peer())
+        await context.abort(code, reason)
+    except grpc.aio.AbortError:
+        raise  # gRPC's own health service has answered
+    except Exception:
+        # A mistake of ours: gRPC logs it with its traceback and answers UNKNOWN.
+        metrics.RPC_ERRORS.labels(method=known, code=grpc.StatusCode.UNKNOWN.name).inc()
+        raise
 
 
 class Server:

@@ -22,12 +22,13 @@ def actors(
     with exit_on_error():
         security = options.load_security(config, settings)
         resolved = learners_config(learner, settings or (), security, Role.ACTOR)
-        metrics.serve(
-            metrics.DRIVER, resolved.metrics.host, resolved.actors.metrics_port, "actors.metrics_port"
-        )
         # Compiled once here; every actor finds the result in the cache.
         warm_up(resolved.env)
         start_ray(resolved.actors)
+        # From now on this container is healthy, and the evaluator, which wants the kernels, may start.
+        metrics.serve(
+            metrics.DRIVER, resolved.metrics.host, resolved.actors.metrics_port, "actors.metrics_port"
+        )
         fleet = Fleet(learner, resolved)
         # Ray has put in a handler of its own, and an exception raised inside its calls is an error to it.
         signal.signal(signal.SIGTERM, lambda *_: fleet.stop())

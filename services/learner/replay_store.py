@@ -1,7 +1,8 @@
 """The replay on disk: what is new is appended, nothing is written twice.
 
-Each file `replay-FIRST-STOP.safetensors` holds the episodes FIRST … STOP-1 of the run, as the frames that the
-replay has in memory. A saved state has its first so many episodes in files that were written before it.
+Each file `replay-FIRST-STOP-DIGEST.safetensors` holds the episodes FIRST … STOP-1 of the run, as the frames
+that the replay has in memory. A saved state has its first so many episodes in files that were written before
+it.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 
 from liir_common.errors import CorruptError
-from liir_common.files import write_atomic
+from liir_common.files import check_digest, write_digested
 
 
 class ReplayStore:
@@ -36,7 +37,7 @@ class ReplayStore:
             data = torch.frombuffer(bytearray(b"".join(frames)), dtype=torch.uint8)
             sizes = torch.tensor([len(frame) for frame in frames])
             name = f"replay-{first:09d}-{first + len(frames):09d}.safetensors"
-            write_atomic(self._path / name, save({"frames": data, "sizes": sizes}))
+            write_digested(self._path / name, save({"frames": data, "sizes": sizes}))
 
     def load(self, first: int, stop: int) -> list[bytes]:
         """The episodes `first` … `stop` - 1; later ones, which no state knows, are removed.
@@ -66,7 +67,7 @@ class ReplayStore:
 
     def _files(self) -> list[tuple[int, int, Path]]:
         found = [
-            (re.fullmatch(r"replay-(\d+)-(\d+)", path.stem), path)
+            (re.match(r"replay-(\d+)-(\d+)", path.stem), path)
             for path in self._path.glob("replay-*.safetensors")
         ]
         return sorted((int(match[1]), int(match[2]), path) for match, path in found if match)
@@ -74,8 +75,9 @@ class ReplayStore:
 
 def _read(path: Path) -> list[bytes]:
     try:
+        check_digest(path)
         tensors = load_file(path)
-    except SafetensorError as error:
+    except (SafetensorError, CorruptError) as error:
         raise CorruptError(
             f"{path} cannot be read ({error}); restore it from a backup, or remove all states to train "
             "from the start"

@@ -30,13 +30,11 @@ from liir_common.build import build, git_commit
 from liir_common.checkpoint import CheckpointStore
 from liir_common.config import Config
 from liir_common.errors import ConfigError, CorruptError
-from liir_common.files import Table, remove_leftovers, write_atomic
+from liir_common.files import Table, check_digest, remove_leftovers, write_atomic, write_digested
 from liir_common.types import EnvSpec
 from services.learner.replay_store import ReplayStore
 
 log = structlog.get_logger()
-
-_STATES_KEPT = 2
 
 
 @dataclass(frozen=True)
@@ -93,18 +91,21 @@ class RunDirectory:
         self._write_json("endpoints.json", {**endpoints, "pid": os.getpid()})
 
     def save_state(self, counters: Counters, tensors: Mapping[str, Tensor], notes: Mapping[str, Any]) -> None:
-        """Keep what the learner needs to go on after `counters.learner_step`; older states but one go."""
+        """Keep what the learner needs to go on after `counters.learner_step`, and the state before it."""
         metadata = {"counters": json.dumps(asdict(counters)), "notes": json.dumps(notes)}
         contiguous = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-        write_atomic(self._state_path(counters.learner_step), save(contiguous, metadata))
-        for old in self._state_paths()[:-_STATES_KEPT]:
-            old.unlink()
+        name = f"state-{counters.learner_step:09d}.safetensors"
+        new = write_digested(self.path / "state" / name, save(contiguous, metadata))
+        before = [path for path in self._state_paths() if _step(path) < counters.learner_step]
+        # A later one is damaged, or the run would have gone on from it.
+        for path in {*self._state_paths()} - {new, *before[-1:]}:
+            path.unlink()
 
     @property
     def oldest_state_step(self) -> int:
         """Learner step of the oldest state that is kept; 0 if there is none."""
         paths = self._state_paths()
-        return int(paths[0].stem.removeprefix("state-")) if paths else 0
+        return _step(paths[0]) if paths else 0
 
     def load_state(self) -> tuple[Counters, dict[str, Tensor], dict[str, Any]] | None:
         """The newest state that can be read, or nothing if the run never saved one.
@@ -115,6 +116,7 @@ class RunDirectory:
         paths = self._state_paths()
         for path in reversed(paths):
             try:
+                check_digest(path)
                 with safe_open(path, framework="pt") as file:
                     metadata = file.metadata()
                     tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
@@ -135,11 +137,13 @@ class RunDirectory:
         record: dict[str, Any] = json.loads((self.path / "run.json").read_text())
         return record
 
-    def _state_path(self, step: int) -> Path:
-        return self.path / "state" / f"state-{step:09d}.safetensors"
-
     def _state_paths(self) -> list[Path]:
         return sorted((self.path / "state").glob("state-*.safetensors"))
 
     def _write_json(self, name: str, value: Mapping[str, Any]) -> None:
         write_atomic(self.path / name, json.dumps(value, indent=1).encode())
+
+
+def _step(state: Path) -> int:
+    """Learner step in a state's name, `state-STEP-DIGEST`."""
+    return int(state.stem.split("-")[1])

@@ -222,6 +222,7 @@ class Trainer:
         metrics.RUN_ENV_STEPS.set(counters.env_steps)
         metrics.RUN_ENV_STEPS_WANTED.set(self.config.training.total_env_steps)
         metrics.CHECKPOINTS.set(store.frozen)
+        metrics.EVALUATION_ENABLED.set(self.config.evaluation.enabled)
         if store.manifests:
             metrics.CHECKPOINT_TIME.set(store.manifests[-1].created)
 

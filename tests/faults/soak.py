@@ -1,7 +1,7 @@
 """`make soak MINUTES=5`: trains for that long and says whether anything grows that should not.
 
 Each process's memory, file descriptors and threads are sampled, and the streams at the learner. The first
-third of the time is warm-up; the growth over the rest is that of the straight line that fits best.
+third of the time is warm-up; for the rest, growth is the slope of the straight line that fits best.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ import sys
 import tempfile
 import time
 from collections import defaultdict
-from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -38,28 +37,41 @@ PROCESSES = {
     "actor": "ray::RolloutActor",
 }
 EVERY_S = 2.0
-MOST_GROWTH = {"memory, MiB": 8.0, "descriptors": 2.0, "threads": 2.0, "streams": 0.5}
-"""Over the whole time after warm-up."""
+START_S = 600.0
+MOST_PER_HOUR = {"memory, MiB": 50.0, "descriptors": 20.0, "threads": 20.0, "streams": 20.0}
+"""The learner does grow: with the evaluations, of which there are thousands an hour here."""
+CERTAIN = 3.0
+"""So many standard errors beyond it, a slope is growth and no chance."""
+BLOCKS = 10
+"""Samples that follow each other are alike; the means of so many stretches of time are nearly independent."""
 
 Samples = dict[tuple[str, str], list[tuple[float, float]]]
 """(process, figure) → (seconds, value), in order"""
 
 
 def sample(process: psutil.Process, name: str, now: float, samples: Samples) -> None:
-    """What one process holds now; nothing if it is gone."""
-    with suppress(psutil.NoSuchProcess), process.oneshot():
+    """What one process holds now.
+
+    Raises:
+        psutil.NoSuchProcess: it is gone.
+    """
+    with process.oneshot():
         samples[name, "memory, MiB"].append((now, process.memory_info().rss / 2**20))
         samples[name, "descriptors"].append((now, process.num_fds()))
         samples[name, "threads"].append((now, process.num_threads()))
 
 
 def measure(run_dir: Path, minutes: float) -> tuple[Samples, int]:
-    """Samples of a training of so many minutes, and its learner steps."""
+    """Samples of a training of so many minutes, and its learner steps.
+
+    Raises:
+        psutil.NoSuchProcess: a process that was sampled has ended, whether another took its place or not.
+    """
     samples: Samples = defaultdict(list)
     with service.training(run_dir, *SETTINGS) as training:
-        service.wait_for(lambda: service.learner_step(run_dir) > 0, "the first learner step")
+        service.wait_for(lambda: service.learner_step(run_dir) > 0, "the first learner step", START_S)
         with service.client(run_dir) as client:
-            service.wait_for(lambda: client.status().actors == ACTORS, "the last actor")
+            service.wait_for(lambda: client.status().actors == ACTORS, "the last actor", START_S)
             found = {
                 f"{name} {number}" if name == "actor" else name: process
                 for name, command in PROCESSES.items()
@@ -78,29 +90,29 @@ def measure(run_dir: Path, minutes: float) -> tuple[Samples, int]:
 
 
 def growth(points: list[tuple[float, float]]) -> tuple[float, float, float]:
-    """Mean, growth over the time after warm-up and slope per hour, of the line that fits best."""
-    seconds, values = np.array(points).T
-    after = seconds >= seconds[-1] / 3
-    slope = np.polyfit(seconds[after], values[after], 1)[0]
-    return values[after].mean(), slope * np.ptp(seconds[after]), slope * 3600
+    """Mean, slope per hour and the slope's standard error, after warm-up."""
+    after = [point for point in points if point[0] >= points[-1][0] / 3]
+    seconds, values = np.array([np.mean(block, 0) for block in np.array_split(after, BLOCKS)]).T
+    (slope, _), covariance = np.polyfit(seconds, values, 1, cov=True)
+    return values.mean(), slope * 3600, np.sqrt(covariance[0, 0]) * 3600
 
 
 def main() -> int:
-    """Print a row for every figure; 1 if one of them grew."""
+    """Print a row for every figure; 1 if one of them grows."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--minutes", type=float, default=5.0)
     minutes = parser.parse_args().minutes
     with tempfile.TemporaryDirectory() as folder:
         samples, steps = measure(Path(folder) / "run", minutes)
     print(f"{minutes:g} minutes, {steps} learner steps; after a third of the time as warm-up:\n")
-    print(f"{'process':12} {'figure':12} {'mean':>9} {'growth':>9} {'per hour':>9}")
+    print(f"{'process':12} {'figure':12} {'mean':>9} {'per hour':>9} {'± error':>9}")
     grew = []
     for (name, figure), points in sorted(samples.items()):
-        mean, grown, per_hour = growth(points)
-        print(f"{name:12} {figure:12} {mean:9.1f} {grown:9.2f} {per_hour:9.1f}")
-        if grown > MOST_GROWTH[figure]:
-            grew.append(f"{name}: {figure} grew by {grown:.2f}")
-    print("\n" + ("\n".join(grew) or "nothing grew"))
+        mean, per_hour, error = growth(points)
+        print(f"{name:12} {figure:12} {mean:9.1f} {per_hour:9.1f} {error:9.1f}")
+        if per_hour - CERTAIN * error > MOST_PER_HOUR[figure]:
+            grew.append(f"{name}: {figure} grows by {per_hour:.0f} ± {error:.0f} an hour")
+    print("\n" + ("\n".join(grew) or "nothing grows"))
     return bool(grew)
 
 

@@ -9,6 +9,7 @@ import socket
 import threading
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, replace
 from hashlib import sha256
@@ -37,7 +38,9 @@ CHUNK = 64 * 1024
 
 
 class Counted(CheckpointService):
-    """Remembers from where downloads were asked for."""
+    """Remembers from where downloads were asked for, and answers slowly if told to."""
+
+    pause_s = 0.0
 
     def __init__(self, run: RunDirectory) -> None:
         super().__init__(run)
@@ -47,6 +50,7 @@ class Counted(CheckpointService):
         self.offsets.append(request.offset)
         async for response in super().GetCheckpoint(request, context):
             yield response
+            await asyncio.sleep(self.pause_s)
 
 
 class Store:
@@ -202,6 +206,25 @@ def test_a_damaged_part_is_thrown_away(store: Store, tmp_path: Path) -> None:
             client.save(100, folder)
         assert files(folder) == []
         assert client.save(100, folder).read_bytes() == store.data
+
+
+def test_a_part_longer_than_the_checkpoint_is_thrown_away(store: Store, tmp_path: Path) -> None:
+    part = tmp_path / f".{store.manifest.sha256}.part"
+    part.write_bytes(store.data + b"more")
+    with store.served() as address, CheckpointClient(address) as client:
+        assert client.save(100, tmp_path).read_bytes() == store.data
+    assert not part.exists()
+
+
+def test_downloads_into_one_folder_wait_for_each_other(store: Store, tmp_path: Path) -> None:
+    def save(address: str) -> bytes:
+        with CheckpointClient(address) as client:
+            return client.save(100, tmp_path / "got").read_bytes()
+
+    with store.served() as address, ThreadPoolExecutor(3) as pool:
+        store.service.pause_s = 0.05
+        assert list(pool.map(save, [address] * 3)) == [store.data] * 3
+    assert files(tmp_path / "got") == ["checkpoint-000000100.json", "checkpoint-000000100.safetensors"]
 
 
 def test_what_another_run_left_is_replaced(store: Store, tmp_path: Path) -> None:

@@ -1,5 +1,9 @@
 """A short turn of `make fuzz`, and the bombs one by one."""
 
+import subprocess
+import sys
+from pathlib import Path
+
 import pytest
 
 from liir_common.rpc import codec
@@ -7,11 +11,22 @@ from liir_common.rpc.gen.liir.v1 import rollout_pb2
 from tests.samples import SPEC
 from tests.security import fuzz_wire
 
+ROOT = Path(__file__).parents[2]
+
 
 def test_the_codec_takes_damaged_messages() -> None:
     outcomes = fuzz_wire.fuzz_codec(3000)
     assert outcomes.total() == 3000
     assert {"trajectory: no message", "trajectory: refused", "trajectory: decoded"} <= set(outcomes)
+
+
+def test_the_codec_takes_what_coverage_leads_to(tmp_path: Path) -> None:
+    pytest.importorskip("atheris")
+    arguments = ["tests.security.fuzz_coverage", "-runs=2000", f"-artifact_prefix={tmp_path}/"]
+    command = [sys.executable, "-m", *arguments]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=200)
+    assert done.returncode == 0, done.stderr[-4000:]
+    assert "Done 2000 runs" in done.stderr
 
 
 def test_a_learner_takes_damaged_calls() -> None:

@@ -95,6 +95,24 @@ def test_bytes_that_are_no_weights_file_are_refused() -> None:
         checkpoint.unpack(garbage, sha256(garbage).hexdigest())
 
 
+def test_what_manifests_say_alike_is_in_memory_once(store: CheckpointStore, tmp_path: Path) -> None:
+    for episode in (100, 200):
+        store.publish(make_manifest(episode), DATA)
+    store.publish(replace(make_manifest(300), config={"seed": 2}), DATA)
+    first, second, third = CheckpointStore(str(tmp_path / "checkpoints")).manifests
+    assert second.config is first.config
+    assert third.env_spec is second.env_spec is first.env_spec
+    assert third.config == {"seed": 2}
+
+
+def test_a_checkpoint_that_an_older_build_deleted_stays_so(store: CheckpointStore, tmp_path: Path) -> None:
+    manifest = make_manifest(100)
+    (tmp_path / "checkpoints" / "deleted-000000100.json").write_text(manifest.to_json())
+    again = CheckpointStore(str(tmp_path / "checkpoints"))
+    assert not again.publish(manifest, DATA)
+    assert (again.frozen, again.manifests) == (1, [])
+
+
 @pytest.mark.parametrize("kind", ["folder", "memory"])
 def test_a_deleted_checkpoint_is_gone_and_its_number_taken(tmp_path: Path, kind: str) -> None:
     url = str(tmp_path) if kind == "folder" else f"memory://{tmp_path}"

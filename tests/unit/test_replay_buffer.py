@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
 
@@ -52,10 +53,10 @@ def test_restored_from_disk_it_is_the_same(tmp_path: Path) -> None:
         replay.add(batch_of(first))
         start = max(store.stop, replay.first)
         store.append(start, replay.frames(start))
-    assert [path.name for path in sorted(tmp_path.iterdir())] == [
-        "replay-000000000-000000004.safetensors",
-        "replay-000000004-000000008.safetensors",
-        "replay-000000008-000000012.safetensors",
+    assert [path.stem[:26] for path in sorted(tmp_path.iterdir())] == [
+        "replay-000000000-000000004",
+        "replay-000000004-000000008",
+        "replay-000000008-000000012",
     ]
     other = Replay(SPEC, capacity=6)
     other.restore(12, ReplayStore(tmp_path).load(6, 12))
@@ -82,13 +83,24 @@ def test_pruning_keeps_what_is_still_wanted(tmp_path: Path) -> None:
     assert len(list(tmp_path.iterdir())) == 2
 
 
-def test_a_missing_or_damaged_file_is_an_error_that_says_so(tmp_path: Path) -> None:
+def test_a_file_that_was_written_before_there_were_digests_is_read(tmp_path: Path) -> None:
+    store = ReplayStore(tmp_path)
+    store.append(0, [b"x", b"y"])
+    (path,) = tmp_path.iterdir()
+    path.rename(tmp_path / "replay-000000000-000000002.safetensors")
+    assert store.load(0, 2) == [b"x", b"y"]
+
+
+@pytest.mark.parametrize("damage", [lambda data: data[:-1], lambda data: data[:-1] + b"{"])
+def test_a_missing_or_damaged_file_is_an_error_that_says_so(
+    tmp_path: Path, damage: Callable[[bytes], bytes]
+) -> None:
     store = ReplayStore(tmp_path)
     store.append(0, [b"x", b"y"])
     store.append(4, [b"z"])
     with pytest.raises(CorruptError, match="2 episodes of the replay, from 2 on, are missing"):
         store.load(0, 5)
-    path = tmp_path / "replay-000000004-000000005.safetensors"
-    path.write_bytes(path.read_bytes()[:-1])
+    (path,) = tmp_path.glob("replay-000000004-*")
+    path.write_bytes(damage(path.read_bytes()))
     with pytest.raises(CorruptError, match=r"replay-000000004.* cannot be read"):
         store.load(4, 5)

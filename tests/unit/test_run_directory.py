@@ -1,5 +1,6 @@
 """The run directory: what a resumed learner finds, also after damage."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -36,17 +37,51 @@ def test_state_round_trip_and_two_are_kept(run: RunDirectory) -> None:
     assert notes == NOTES
 
 
-def test_a_damaged_state_falls_back_to_the_one_before(run: RunDirectory) -> None:
+def states(run: RunDirectory) -> list[Path]:
+    return sorted((run.path / "state").iterdir())
+
+
+def truncate(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:40])
+
+
+def flip_a_bit(path: Path) -> None:
+    """In the last weight, which stays a number."""
+    data = bytearray(path.read_bytes())
+    data[-2] ^= 1
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize("damage", [truncate, flip_a_bit])
+def test_a_damaged_state_falls_back_to_the_one_before(
+    run: RunDirectory, damage: Callable[[Path], None]
+) -> None:
     save(run, 1)
     save(run, 2)
-    newest = run.path / "state" / "state-000000002.safetensors"
-    newest.write_bytes(newest.read_bytes()[:40])
+    damage(states(run)[-1])
     loaded = run.load_state()
     assert loaded is not None
     assert loaded[0].learner_step == 1
-    (run.path / "state" / "state-000000001.safetensors").write_bytes(b"")
+    damage(states(run)[0])
     with pytest.raises(CorruptError, match="restore one from a backup"):
         run.load_state()
+
+
+def test_a_save_replaces_the_damaged_ones_that_it_makes_again(run: RunDirectory) -> None:
+    for step in (1, 3, 5):
+        save(run, step)
+    flip_a_bit(states(run)[-1])
+    save(run, 4)
+    assert [path.stem[:15] for path in states(run)] == ["state-000000003", "state-000000004"]
+
+
+def test_a_state_that_was_saved_before_there_were_digests_is_loaded(run: RunDirectory) -> None:
+    save(run, 1)
+    (path,) = states(run)
+    path.rename(path.with_name("state-000000001.safetensors"))
+    loaded = run.load_state()
+    assert loaded is not None
+    assert loaded[0].learner_step == run.oldest_state_step == 1
 
 
 def test_a_run_keeps_its_id_and_its_environment(run: RunDirectory) -> None:

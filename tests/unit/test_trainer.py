@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from liir_common import config
+from liir_common import config, metrics
 from liir_common.types import Weights
 from services.learner.algorithms import make_algorithm
 from services.learner.intake import Opening
@@ -136,14 +136,21 @@ def test_stop_ends_a_trainer_that_waits(tmp_path: Path) -> None:
 def test_the_replay_on_disk_is_what_the_kept_states_need(tmp_path: Path) -> None:
     """Two states are kept, of learner steps 10 and 12; the older one reaches back to episode 30."""
     Played(tmp_path, 12, "training.save_interval=2", "algorithm=qmix", *REPLAY).train()
-    names = sorted(path.stem for path in (tmp_path / "state").glob("replay-*"))
+    names = sorted(path.stem[:26] for path in (tmp_path / "state").glob("replay-*"))
     assert names == [
         "replay-000000024-000000032",
         "replay-000000032-000000040",
         "replay-000000040-000000048",
     ]
-    (tmp_path / "state" / "state-000000012.safetensors").write_bytes(b"damaged")
+    (newest,) = (tmp_path / "state").glob("state-000000012-*")
+    newest.write_bytes(b"damaged")
     again = Played(tmp_path, 12, "training.save_interval=2", "algorithm=qmix", *REPLAY)
     assert again.trainer.next_batch == 10
     assert again.trainer.algorithm.replay is not None
     assert (again.trainer.algorithm.replay.first, again.trainer.algorithm.replay.total) == (30, 40)
+
+
+@pytest.mark.parametrize("enabled", [True, False])
+def test_a_run_says_whether_its_checkpoints_are_to_be_tested(tmp_path: Path, enabled: bool) -> None:
+    Played(tmp_path, 1, f"evaluation.enabled={enabled}")
+    assert metrics.LEARNER.get_sample_value("liir_evaluation_enabled") == enabled

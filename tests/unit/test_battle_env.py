@@ -14,10 +14,12 @@ from pettingzoo.test import parallel_api_test, parallel_seed_test, render_test
 from pettingzoo.utils.conversions import parallel_to_aec
 from typer.testing import CliRunner
 
+from liir_common.battle import bench
 from liir_common.battle.bench import bench_sim
-from liir_common.battle.calibrate import calibrate
+from liir_common.battle.calibrate import POLICIES, TARGETS, calibrate, estimate, format_rows
 from liir_common.battle.engine import SIMULATOR_VERSION
 from liir_common.battle.env import BattleEnv, battle_spec, parallel_env
+from liir_common.battle.policies import play
 from liir_common.battle.render import LETTERS, Shot, draw_rgb
 from liir_common.battle.scenarios import SCENARIOS, make_battle
 from liir_common.battle.units import UNIT_TYPES
@@ -344,15 +346,68 @@ def test_unit_types_have_letters_of_their_own() -> None:
     assert len(set(LETTERS.values())) == len(LETTERS)
 
 
-def test_bench_and_calibration_measure() -> None:
+def test_bench_measures() -> None:
     assert bench_sim("3m", episodes=200, repeats=2)["env_steps_per_s"] > 50_000
-    rows = {(r.target.policy, r.target.figure): r for r in calibrate("3m", episodes=1000)}
-    assert abs(rows["random", "mean length"].difference) < 0.05
-    assert abs(rows["random", "mean return"].difference) < 0.10
-    assert abs(rows["stand", "mean length"].difference) < 0.03
-    assert rows["step aside", "dead allies"].measured == 0
+
+
+@pytest.mark.parametrize(
+    ("map_name", "policy", "figure", "limit", "episodes"),
+    [
+        ("3m", "random", "mean length", 0.05, 2000),
+        ("3m", "random", "mean return", 0.10, 2000),
+        ("3m", "stand", "mean length", 0.03, 500),
+        ("3m", "step aside", "dead allies", 0.0, 100),
+        # An episode's length has a standard deviation of 16 here, and the mean is 4 % off.
+        ("8m", "random", "mean length", 0.05, 10_000),
+        ("8m", "random", "mean return", 0.10, 2000),
+        ("8m", "stand", "mean length", 0.03, 500),
+        ("8m", "step aside", "dead allies", 0.0, 100),
+        ("2s3z", "random", "mean length", 0.05, 2000),
+        ("2s3z", "random", "mean return", 0.10, 2000),
+        ("2s3z", "stand", "mean length", 0.03, 500),
+        ("2s3z", "closest enemy", "win rate", 0.05 / 0.9, 2500),
+    ],
+)
+def test_calibration_is_within_its_limits(
+    map_name: str, policy: str, figure: str, limit: float, episodes: int
+) -> None:
+    """Over four seeds, with four standard errors to spare."""
+    (target,) = (t for t in TARGETS[map_name] if (t.policy, t.figure) == (policy, figure))
+    tables, _ = make_battle(map_name)
+    outcomes = np.concatenate([play(tables, POLICIES[policy], episodes, seed) for seed in range(4)])
+    measured, error = estimate(outcomes, figure)
+    assert abs(measured - target.value) + 4 * error <= limit * target.value
+
+
+def test_calibration_is_shown_with_standard_errors() -> None:
+    command = ["calibrate", "--map", "3m", "--episodes", "200", "--seed"]
+    first, second = (
+        {(row["policy"], row["figure"]): row for row in json.loads(answer.stdout)["3m"]}
+        for answer in (CliRunner().invoke(app, [*command, seed, "--json"]) for seed in ("0", "1"))
+    )
+    length = first["random", "mean length"]
+    assert length["measured"] != second["random", "mean length"]["measured"]
+    # The standard deviation is 9 steps.
+    assert length["standard_error"] == pytest.approx(9 / 200**0.5, rel=0.2)
+    assert first["random", "median length"]["standard_error"] == pytest.approx(0.7, abs=0.4)
+    assert first["step aside", "dead allies"]["standard_error"] == 0
+    assert f"{length['measured']:9.2f}{length['standard_error']:7.2f}" in format_rows(
+        "3m", calibrate("3m", 200)
+    )
     with pytest.raises(ValueError, match="nothing is published"):
         calibrate("25m")
+
+
+def test_bench_tells_compiling_from_loading(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With one kernel of the battle instead of all."""
+    first_episode = bench._FIRST_EPISODE
+    assert "play(tables, RANDOM, episodes=1)" in first_episode
+    start = "import liir_common.battle.engine as e; e.reset(tables, _, e.np.uint64(0))"
+    monkeypatch.setattr(
+        bench, "_FIRST_EPISODE", first_episode.replace("play(tables, RANDOM, episodes=1)", start)
+    )
+    seconds = bench.bench_compile("3m")
+    assert 0 < 3 * seconds["load_s"] < seconds["compile_s"]
 
 
 def test_maps_are_listed() -> None:

@@ -6,6 +6,7 @@ its code, SMAC v1. The package and the game are no requirements of this project.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,9 @@ from liir_common.battle.spaces import (
 )
 from liir_common.errors import ConfigError, EpisodeLostError
 from liir_common.types import FloatArray
+
+_FIGURES: Mapping[str, type] = {"battle_won": bool, "dead_allies": int, "dead_enemies": int}
+"""What SMAC says of the battle in every step"""
 
 
 class SmacEnv(ParallelEnv[str, Observation, np.int64]):
@@ -41,6 +45,9 @@ class SmacEnv(ParallelEnv[str, Observation, np.int64]):
         self._game = _start(map_name, options)
         sizes = self._game.get_env_info()
         n, n_actions, obs_dim = sizes["n_agents"], sizes["n_actions"], sizes["obs_shape"]
+        # Observations with the step's number have one place more than SMAC says.
+        obs_dim += bool(options.get("obs_timestep_number"))
+        state_dim = n * obs_dim if options.get("obs_instead_of_state") else sizes["state_shape"]
         self.episode_limit = int(sizes["episode_limit"])
         self.possible_agents = [f"ally_{i}" for i in range(n)]
         self.agents: list[str] = []
@@ -52,7 +59,7 @@ class SmacEnv(ParallelEnv[str, Observation, np.int64]):
         self._observation_spaces = dict.fromkeys(
             self.possible_agents, masked_observations(obs_dim, n_actions)
         )
-        self.state_space = Box(-np.inf, np.inf, (sizes["state_shape"],), np.float32)
+        self.state_space = Box(-np.inf, np.inf, (state_dim,), np.float32)
 
     def observation_space(self, agent: str) -> Dict:
         """The observation in [-1, 1] and the action mask of one agent."""
@@ -69,7 +76,7 @@ class SmacEnv(ParallelEnv[str, Observation, np.int64]):
         self._game.reset()
         self.agents = list(self.possible_agents)
         self._observe()
-        return self._observations(), self._infos({})
+        return self._observations(), self._infos(dict.fromkeys(_FIGURES, 0), ended=False)
 
     def step(
         self, actions: dict[str, Any]
@@ -97,7 +104,7 @@ class SmacEnv(ParallelEnv[str, Observation, np.int64]):
             dict.fromkeys(self.agents, float(reward)),
             dict.fromkeys(self.agents, bool(ended) and not at_limit),
             dict.fromkeys(self.agents, at_limit),
-            self._infos(_figures(outcome) if ended else {}),
+            self._infos(outcome, ended),
         )
         if ended:
             self.agents = []
@@ -121,7 +128,10 @@ class SmacEnv(ParallelEnv[str, Observation, np.int64]):
             for agent, obs, mask in zip(self.agents, self._obs, self._masks, strict=True)
         }
 
-    def _infos(self, figures: dict[str, float]) -> dict[str, dict[str, Any]]:
+    def _infos(self, outcome: dict[str, Any], ended: bool) -> dict[str, dict[str, Any]]:
+        figures = {name: kind(outcome[name]) for name, kind in _FIGURES.items()}
+        if ended:
+            figures["won"] = int(outcome["battle_won"])
         return {
             agent: {
                 "alive": bool(self._game.get_unit_by_id(i).health > 0),
@@ -130,15 +140,6 @@ class SmacEnv(ParallelEnv[str, Observation, np.int64]):
             }
             for i, (agent, mask) in enumerate(zip(self.agents, self._masks, strict=True))
         }
-
-
-def _figures(outcome: dict[str, Any]) -> dict[str, float]:
-    """`INFO_KEYS` from the last info of SMAC."""
-    return {
-        "won": float(outcome["battle_won"]),
-        "dead_allies": float(outcome["dead_allies"]),
-        "dead_enemies": float(outcome["dead_enemies"]),
-    }
 
 
 def _start(map_name: str, options: dict[str, Any]) -> Any:

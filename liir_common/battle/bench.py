@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import time
 from statistics import median
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from liir_common.battle.policies import RANDOM, play
@@ -29,3 +33,27 @@ def bench_sim(map_name: str, episodes: int = 2000, repeats: int = 5) -> dict[str
         "episodes": episodes,
         "repeats": repeats,
     }
+
+
+_FIRST_EPISODE = """
+import sys, time
+from liir_common.battle.policies import RANDOM, play
+from liir_common.battle.scenarios import make_battle
+tables, _ = make_battle(sys.argv[1])
+start = time.process_time()
+play(tables, RANDOM, episodes=1)
+print(time.process_time() - start)
+"""
+
+
+def bench_compile(map_name: str) -> dict[str, float]:
+    """Seconds of CPU time of a process's first episode: compiling, and loading what has been compiled."""
+    with TemporaryDirectory() as cache:
+        return {name: _first_episode(map_name, cache) for name in ("compile_s", "load_s")}
+
+
+def _first_episode(map_name: str, cache: str) -> float:
+    command = [sys.executable, "-c", _FIRST_EPISODE, map_name]
+    env = {**os.environ, "NUMBA_CACHE_DIR": cache}
+    done = subprocess.run(command, env=env, stdout=subprocess.PIPE, text=True, check=True)
+    return float(done.stdout)

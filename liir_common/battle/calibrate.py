@@ -16,8 +16,15 @@ from numpy.typing import NDArray
 from liir_common.battle.policies import CLOSEST_ENEMY, RANDOM, STAND, STEP_ASIDE, play
 from liir_common.battle.scenarios import make_battle
 
-_LENGTH, _RETURN, _WON, _DEAD_ALLIES = range(4)
-_POLICIES: Mapping[str, int] = {
+_COLUMNS: Mapping[str, int] = {
+    "mean length": 0,
+    "median length": 0,
+    "mean return": 1,
+    "win rate": 2,
+    "dead allies": 3,
+}
+"""Of the outcomes of `policies.play`"""
+POLICIES: Mapping[str, int] = {
     "random": RANDOM,
     "stand": STAND,
     "step aside": STEP_ASIDE,
@@ -68,6 +75,7 @@ class Row:
 
     target: Target
     measured: float
+    standard_error: float
 
     @property
     def difference(self) -> float:
@@ -87,28 +95,27 @@ def calibrate(map_name: str, episodes: int = 2000, seed: int = 0, **options: Any
             f"nothing is published about {map_name!r} to compare with; known: {', '.join(TARGETS)}"
         )
     targets = TARGETS[map_name]
-    outcomes = {name: play(tables, _POLICIES[name], episodes, seed) for name in {t.policy for t in targets}}
-    return [Row(target, _figure(outcomes[target.policy], target.figure)) for target in targets]
+    outcomes = {name: play(tables, POLICIES[name], episodes, seed) for name in {t.policy for t in targets}}
+    return [Row(target, *estimate(outcomes[target.policy], target.figure)) for target in targets]
 
 
-def _figure(outcomes: NDArray[np.float64], figure: str) -> float:
-    values = {
-        "mean length": outcomes[:, _LENGTH].mean(),
-        "median length": np.median(outcomes[:, _LENGTH]),
-        "mean return": outcomes[:, _RETURN].mean(),
-        "win rate": outcomes[:, _WON].mean(),
-        "dead allies": outcomes[:, _DEAD_ALLIES].mean(),
-    }
-    return float(values[figure])
+def estimate(outcomes: NDArray[np.float64], figure: str) -> tuple[float, float]:
+    """A figure of outcomes [episodes, 5] as `policies.play` returns them, and its standard error."""
+    values, root = outcomes[:, _COLUMNS[figure]], np.sqrt(len(outcomes))
+    if figure.startswith("median"):
+        # As many values lie between these two as the rank of the median is uncertain by.
+        low, high = np.quantile(values, np.clip([0.5 - 0.5 / root, 0.5 + 0.5 / root], 0, 1))
+        return float(np.median(values)), float(high - low) / 2
+    return float(values.mean()), float(values.std() / root)
 
 
 def format_rows(map_name: str, rows: list[Row]) -> str:
-    """A table for people."""
-    lines = [f"{map_name:<8}{'policy':<15}{'figure':<15}{'real':>8}{'here':>9}{'diff':>9}"]
+    """A table for people; ± is one standard error."""
+    lines = [f"{map_name:<8}{'policy':<15}{'figure':<15}{'real':>8}{'here':>9}{'±':>7}{'diff':>9}"]
     for row in rows:
         target = row.target
         lines.append(
             f"{'':<8}{target.policy:<15}{target.figure:<15}"
-            f"{target.value:8.2f}{row.measured:9.2f}{row.difference:9.1%}"
+            f"{target.value:8.2f}{row.measured:9.2f}{row.standard_error:7.2f}{row.difference:9.1%}"
         )
     return "\n".join(lines)

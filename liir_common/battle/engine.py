@@ -193,28 +193,26 @@ def _order_attack(tables, battle, i, number):
             return
     if unit.order == ATTACK and unit.target == target and not rules.repeated_order_restarts:
         return
-    _interrupt(rules, battle.clock[0], unit, spec)
+    _interrupt(rules, unit, spec)
     unit.order, unit.target = ATTACK, target
 
 
 @inlined
 def _order_move(tables, battle, i, action):
-    unit, now = battle.units[i], battle.clock[0]
-    _interrupt(tables.rules[0], now, unit, tables.specs[i])
+    unit = battle.units[i]
+    _interrupt(tables.rules[0], unit, tables.specs[i])
     unit.target = -1
     unit.order = IDLE if action == STOP else MOVE
     if unit.order == MOVE:
-        unit.free_at = now
+        unit.free_at = battle.clock[0]
         length = tables.rules[0].move_amount
         unit.goal_x = battle.x[i] + length * ((action == EAST) - (action == WEST))
         unit.goal_y = battle.y[i] + length * ((action == NORTH) - (action == SOUTH))
 
 
 @inlined
-def _interrupt(rules, now, unit, spec):
+def _interrupt(rules, unit, spec):
     """A new order always stops an attack before its first hit, and by the rules also between hits."""
-    if unit.hits == spec.hits and rules.cooldown_from_release:
-        unit.ready_at = now
     if unit.hits == spec.hits or rules.new_order_cancels_hits:
         unit.hits = 0
 
@@ -329,16 +327,23 @@ def _attack(tables, battle, i, now):
                 _die(tables, battle, i)
                 return False
             unit.missile_x, unit.missile_y = battle.x[target], battle.y[target]
-        delay = rng.uniform(battle.stream)
-        if tables.rules[0].integer_delay:
-            delay = np.floor(delay * (_DELAY_SPAN + 1.0)) / _DELAY_SPAN
-        unit.ready_at = now + spec.period + _DELAY_LOW + _DELAY_SPAN * delay
+        if not tables.rules[0].cooldown_from_release:
+            _cool_down(tables.rules[0], battle, i, spec.period, now)
         unit.hit_at = now + spec.damage_point
         unit.hits = spec.hits
         unit.aim = unit.target
         if now >= unit.hit_at:
             _release(tables, battle, i, now)
     return False
+
+
+@inlined
+def _cool_down(rules, battle, i, period, since):
+    """The weapon may fire again a period and a random delay after `since`."""
+    delay = rng.uniform(battle.stream)
+    if rules.integer_delay:
+        delay = np.floor(delay * (_DELAY_SPAN + 1.0)) / _DELAY_SPAN
+    battle.units[i].ready_at = since + period + _DELAY_LOW + _DELAY_SPAN * delay
 
 
 @inlined
@@ -355,10 +360,10 @@ def _release(tables, battle, i, now):
     """The next hit of the attack under way; a dead target ends the attack."""
     unit, spec = battle.units[i], tables.specs[i]
     if not battle.units[unit.aim].alive and not (spec.beams and unit.hits == spec.hits):
-        if unit.hits == spec.hits and tables.rules[0].cooldown_from_release:
-            unit.ready_at = now
         unit.hits = 0
         return
+    if tables.rules[0].cooldown_from_release and unit.hits == spec.hits:
+        _cool_down(tables.rules[0], battle, i, spec.period, unit.hit_at)
     unit.hits -= 1
     unit.hit_at += spec.hit_interval
     if tables.rules[0].stand_after_hit:

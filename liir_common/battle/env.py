@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Sequence
-from typing import Any, TypedDict
+from typing import Any
 
 import numpy as np
 from gymnasium.spaces import Box, Dict
 from numpy.typing import NDArray
 from pettingzoo.utils.env import ParallelEnv
 
-from liir_common.battle import engine
+from liir_common.battle import engine, snapshots
 from liir_common.battle.observation import observe
 from liir_common.battle.parameters import resolve
 from liir_common.battle.policies import make_buffers
 from liir_common.battle.render import draw_ansi, draw_rgb
 from liir_common.battle.scenarios import find_scenario
+from liir_common.battle.snapshots import UnitRecord
 from liir_common.battle.spaces import (
     INFO_KEYS,
     AvailableActions,
@@ -24,40 +25,8 @@ from liir_common.battle.spaces import (
     joint_action,
     masked_observations,
 )
-from liir_common.battle.tables import ORDERS, build_battle, build_tables, roster
-from liir_common.battle.units import ENERGY_MAX
+from liir_common.battle.tables import build_battle, build_tables, roster
 from liir_common.types import EnvSpec
-
-_STATUS_OF_INFO = {
-    "won": engine.WON,
-    "dead_allies": engine.DEAD_ALLIES,
-    "dead_enemies": engine.DEAD_ENEMIES,
-}
-
-
-class UnitRecord(TypedDict):
-    """One unit as plain values, for people and tests."""
-
-    team: str
-    """"ally" or "enemy" """
-    id: int
-    """Number within the team"""
-    unit_type: str
-    x: float
-    y: float
-    health: float
-    health_max: float
-    shield: float
-    shield_max: float
-    energy: float
-    cooldown: float
-    """Loops until the weapon may fire"""
-    radius: float
-    alive: bool
-    order: str
-    """One of `tables.ORDERS`"""
-    target: int | None
-    """Number of the unit attacked, within the other team; of the unit healed, within its own"""
 
 
 class BattleEnv(ParallelEnv[str, Observation, np.int64]):
@@ -162,86 +131,26 @@ class BattleEnv(ParallelEnv[str, Observation, np.int64]):
 
     def snapshot(self) -> list[UnitRecord]:
         """All units as plain records, allies first."""
-        return [self._record(i) for i in range(len(self._unit_types))]
+        return snapshots.take(self._tables, self._battle, self._unit_types)
 
     def restore(self, snapshot: Sequence[UnitRecord]) -> None:
         """Put units into the recorded situation.
 
-        Attacks, missiles and walks that are under way end, and shields wait as after a hit.
+        Attacks and missiles that are under way end, and shields wait as after a hit. A refused snapshot
+        changes nothing.
 
         Raises:
-            ValueError: other units than the map's, or a unit where no unit can be.
+            RuntimeError: no episode is running.
+            ValueError: other units than the map's, or a unit that cannot be so.
         """
-        expected = [self._identity(self._record(i)) for i in range(len(self._unit_types))]
-        got = [self._identity(record) for record in snapshot]
-        if got != expected:
-            raise ValueError(f"this map wants the units {expected}, got {got}")
-        for i, record in enumerate(snapshot):
-            self._put(i, record)
+        if not self.agents:
+            raise RuntimeError("no episode is running; call reset() before restore()")
+        snapshots.put(self._tables, self._battle, self._unit_types, snapshot)
         alive = self._battle.units["alive"]
         n = len(self.possible_agents)
         self._battle.status[engine.DEAD_ALLIES] = n - alive[:n].sum()
         self._battle.status[engine.DEAD_ENEMIES] = len(alive) - n - alive[n:].sum()
         self._observe()
-
-    @staticmethod
-    def _identity(record: UnitRecord) -> tuple[str, int, str]:
-        return record["team"], record["id"], record["unit_type"]
-
-    def _record(self, i: int) -> UnitRecord:
-        unit, spec, n = self._battle.units[i], self._tables.specs[i], len(self.possible_agents)
-        is_ally, target = i < n, int(unit["target"])
-        return UnitRecord(
-            team="ally" if is_ally else "enemy",
-            id=i if is_ally else i - n,
-            unit_type=self._unit_types[i],
-            x=float(self._battle.x[i]),
-            y=float(self._battle.y[i]),
-            health=float(unit["health"]),
-            health_max=float(spec["health"]),
-            shield=float(unit["shield"]),
-            shield_max=float(spec["shield"]),
-            energy=float(unit["energy"]),
-            cooldown=max(0.0, float(unit["ready_at"] - self._battle.clock[0])),
-            radius=float(spec["radius"]),
-            alive=bool(unit["alive"]),
-            order=ORDERS[unit["order"]],
-            target=None if target < 0 else target - n if target >= n else target,
-        )
-
-    def _put(self, i: int, record: UnitRecord) -> None:
-        unit, spec, n = self._battle.units[i], self._tables.specs[i], len(self.possible_agents)
-        x, y, now = record["x"], record["y"], self._battle.clock[0]
-        cells = self._tables.layers[spec["layer"]]
-        inside = 0 <= x < cells.shape[0] and 0 <= y < cells.shape[1]
-        if not (inside and cells[int(x), int(y)]):
-            raise ValueError(
-                f"{record['team']} {record['id']} wants a place that units can reach, got {x, y}"
-            )
-        if not (0 <= record["health"] <= spec["health"] and 0 <= record["shield"] <= spec["shield"]):
-            raise ValueError(
-                f"{record['team']} {record['id']} wants health in [0, {spec['health']}] and shield in "
-                f"[0, {spec['shield']}], got {record['health']} and {record['shield']}"
-            )
-        if not 0 <= record["energy"] <= ENERGY_MAX:
-            raise ValueError(
-                f"{record['team']} {record['id']} wants energy in [0, {ENERGY_MAX}], got {record['energy']}"
-            )
-        if record["alive"] != (record["health"] > 0):
-            raise ValueError(f"{record['team']} {record['id']}: alive wants to mean health above 0")
-        if record["order"] not in ORDERS:
-            raise ValueError(f"order wants one of {ORDERS}, got {record['order']!r}")
-        self._battle.x[i], self._battle.y[i] = x, y
-        unit["health"], unit["shield"], unit["energy"] = record["health"], record["shield"], record["energy"]
-        unit["alive"], unit["order"] = record["alive"], ORDERS.index(record["order"])
-        unit["ready_at"], unit["free_at"], unit["hits"] = now + record["cooldown"], now, 0
-        unit["hurt_at"] = now
-        if i < n:
-            unit["goal_x"], unit["goal_y"] = x, y
-        target = record["target"]
-        aims_at_allies = (i < n) == bool(spec["heals"])
-        unit["target"] = -1 if target is None else target if aims_at_allies else target + n
-        unit["attacker"] = unit["missile_target"] = -1
 
     def render(self) -> str | NDArray[np.uint8] | None:
         """The battlefield as text ("ansi"), printed ("human") or as an image [H, W, 3] ("rgb_array")."""
@@ -264,13 +173,25 @@ class BattleEnv(ParallelEnv[str, Observation, np.int64]):
         }
 
     def _infos(self) -> dict[str, dict[str, Any]]:
-        status = self._battle.status
-        ended = status[engine.TERMINATED] or status[engine.TRUNCATED]
-        outcome = {key: float(status[at]) for key, at in _STATUS_OF_INFO.items()} if ended else {}
+        figures = self._figures()
         return {
-            agent: {"alive": bool(alive), "action_mask": mask.copy(), **outcome}
+            agent: {"alive": bool(alive), "action_mask": mask.copy(), **figures}
             for agent, alive, mask in zip(self.agents, self._buffers.alive, self._masks, strict=True)
         }
+
+    def _figures(self) -> dict[str, Any]:
+        """What SMAC v1 says of the battle in every step, and at its end what training reads."""
+        status = self._battle.status
+        figures: dict[str, Any] = {
+            "battle_won": bool(status[engine.WON]),
+            "dead_allies": int(status[engine.DEAD_ALLIES]),
+            "dead_enemies": int(status[engine.DEAD_ENEMIES]),
+        }
+        if status[engine.TERMINATED] or status[engine.TRUNCATED]:
+            figures["won"] = int(status[engine.WON])
+        if status[engine.TRUNCATED] and self._tables.rules["continuing_episode"][0]:
+            figures["episode_limit"] = True
+        return figures
 
 
 def parallel_env(map_name: str, render_mode: str | None = None, **options: Any) -> BattleEnv:

@@ -53,17 +53,25 @@ def _write_moves(tables, battle, i, obs, mask):
     at = _MOVES
     if rules.obs_pathing_grid:
         for k in range(len(_SURROUNDINGS)):
-            x, y = int(battle.x[i]) + _SURROUNDINGS[k, 0], int(battle.y[i]) + _SURROUNDINGS[k, 1]
+            x, y = _cell_around(rules, battle, i, k)
             obs[at + k] = _is_open(tables.pathing, x, y, True)
         at += len(_SURROUNDINGS)
     if rules.obs_terrain_height:
         for k in range(len(_SURROUNDINGS)):
-            x, y = int(battle.x[i]) + _SURROUNDINGS[k, 0], int(battle.y[i]) + _SURROUNDINGS[k, 1]
+            x, y = _cell_around(rules, battle, i, k)
             inside = 0 <= x < tables.height.shape[0] and 0 <= y < tables.height.shape[1]
             obs[at + k] = tables.height[x, y] if inside else 1.0
         at += len(_SURROUNDINGS) + 1
         obs[at - 1] = tables.height[int(battle.x[i]), int(battle.y[i])]
     return at
+
+
+@inlined
+def _cell_around(rules, battle, i, k):
+    """The cell of the k-th place that is probed around unit i, maybe off the map."""
+    x = int(battle.x[i]) + rules.move_amount * _SURROUNDINGS[k, 0]
+    y = int(battle.y[i]) + rules.move_amount * _SURROUNDINGS[k, 1]
+    return int(x), int(y)
 
 
 @inlined

@@ -22,8 +22,7 @@ class Options:
     """SMAC v1's options, under its names and with its defaults.
 
     Those that concern the game's window, version, difficulty and replays have nothing to act on here;
-    `heuristic_ai` is a policy (`policies.CLOSEST_ENEMY`), and `continuing_episode` needs no switch because
-    termination and truncation are told apart.
+    `heuristic_ai` and `heuristic_rest` are policies (`policies.CLOSEST_ENEMY`).
     """
 
     step_mul: int = field(default=8, metadata={"minimum": 1, "maximum": 1000})
@@ -56,6 +55,8 @@ class Options:
     reward_scale: bool = True
     """Divide so that the largest return is `reward_scale_rate`."""
     reward_scale_rate: float = _at_least(20.0, 1e-9)
+    continuing_episode: bool = False
+    """The info has `episode_limit` where the limit ends an episode; truncation says so in any case."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +83,8 @@ class Parameters:
     new_order_cancels_hits: bool = True
     """A new order cancels hits of a several-hit attack that are still to come."""
     cooldown_from_release: bool = False
-    """An attack that is interrupted before its first hit costs no cooldown."""
+    """The time between attacks counts from the first hit, not from the attack's beginning, so that the way to
+    the damage point lengthens it and an attack that is interrupted before costs nothing."""
     integer_delay: bool = False
     """The random delay between attacks is a whole number of loops."""
     rescan_period: int = _at_least(8, 1)
@@ -116,8 +118,10 @@ class Settings(Options, Parameters):
     """All of them, resolved."""
 
     def canonical(self) -> str:
-        """Sorted JSON of all values: equal texts mean equal rules."""
-        return json.dumps(asdict(self), sort_keys=True)
+        """Sorted JSON of all values that are played by: equal texts mean equal rules."""
+        values = asdict(self)
+        del values["continuing_episode"]
+        return json.dumps(values, sort_keys=True)
 
 
 def resolve(options: Mapping[str, Any]) -> Settings:

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 PIXELS_PER_CELL = 16
 LETTERS = {
@@ -25,6 +25,8 @@ LETTERS = {
 _GROUND, _VOID = (52, 60, 52), (20, 22, 24)
 _COLOURS = {"ally": (86, 156, 214), "enemy": (209, 84, 78)}
 _TRACER, _LIFE, _SHIELD = (255, 226, 150), (96, 200, 120), (120, 190, 255)
+_BLAST = 0.35
+"""Opacity of a blast"""
 
 Units = Sequence[Mapping[str, Any]]
 """Records as `BattleEnv.snapshot` returns them"""
@@ -36,6 +38,14 @@ class Shot(NamedTuple):
 
     attacker: int
     target: int
+
+
+class Blast(NamedTuple):
+    """Where a unit burst, and how far that reached."""
+
+    x: float
+    y: float
+    radius: float
 
 
 def draw_ansi(units: Units, pathing: NDArray[np.bool_]) -> str:
@@ -54,7 +64,11 @@ def draw_ansi(units: Units, pathing: NDArray[np.bool_]) -> str:
 
 
 def draw_rgb(
-    units: Units, pathing: NDArray[np.bool_], shots: Sequence[Shot] = (), scale: int = PIXELS_PER_CELL
+    units: Units,
+    pathing: NDArray[np.bool_],
+    shots: Sequence[Shot] = (),
+    blasts: Sequence[Blast] = (),
+    scale: int = PIXELS_PER_CELL,
 ) -> Image:
     """Image [H, W, 3] with `scale` pixels per cell, north up.
 
@@ -63,6 +77,8 @@ def draw_rgb(
     cells = np.where(pathing.T[::-1, :, None], _GROUND, _VOID).astype(np.uint8)
     image = cells.repeat(scale, axis=0).repeat(scale, axis=1)
     alive = [unit for unit in units if unit["alive"]]
+    for blast in blasts:
+        _paint_disc(image, _pixel(image, blast._asdict(), scale), blast.radius * scale, _TRACER, _BLAST)
     for unit in alive:
         _draw_disc(image, unit, scale)
     for shot in shots:
@@ -73,15 +89,21 @@ def draw_rgb(
 
 
 def _draw_disc(image: Image, unit: Mapping[str, Any], scale: int) -> None:
-    (row, column), radius = _pixel(image, unit, scale), unit["radius"] * scale
+    vitality = (unit["health"] + unit["shield"]) / (unit["health_max"] + unit["shield_max"])
+    colour = np.array(_COLOURS[unit["team"]]) * (0.35 + 0.65 * vitality)
+    _paint_disc(image, _pixel(image, unit, scale), unit["radius"] * scale, colour)
+
+
+def _paint_disc(
+    image: Image, centre: tuple[float, float], radius: float, colour: ArrayLike, opacity: float = 1.0
+) -> None:
+    row, column = centre
     top, left = max(0, int(row - radius) - 1), max(0, int(column - radius) - 1)
     window = image[top : int(row + radius) + 2, left : int(column + radius) + 2]
     rows, columns = np.indices(window.shape[:2])
     # How much of each pixel the disc covers, so that its edge is smooth.
     cover = np.clip(radius - np.hypot(rows + top - row, columns + left - column) + 0.5, 0, 1)[..., None]
-    vitality = (unit["health"] + unit["shield"]) / (unit["health_max"] + unit["shield_max"])
-    colour = np.array(_COLOURS[unit["team"]]) * (0.35 + 0.65 * vitality)
-    window[:] = cover * colour + (1 - cover) * window
+    window[:] = opacity * cover * np.asarray(colour) + (1 - opacity * cover) * window
 
 
 def _draw_bars(image: Image, unit: Mapping[str, Any], scale: int) -> None:

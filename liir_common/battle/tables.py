@@ -50,8 +50,8 @@ IDLE, MOVE, ATTACK, ATTACK_MOVE = range(4)
 ORDERS = ("idle", "move", "attack", "attack_move")
 SIGHT, SHOOT_RANGE = 9.0, 6.0
 """SMAC v1's ranges, from centre to centre and for all unit types."""
-SURROUNDINGS = ((0, 4), (0, -4), (4, 0), (-4, 0), (2, 2), (-2, -2), (2, -2), (-2, 2))
-"""Where SMAC v1 probes the ground around a unit."""
+SURROUNDINGS = ((0, 2), (0, -2), (2, 0), (-2, 0), (1, 1), (-1, -1), (1, -1), (-1, 1))
+"""Where SMAC v1 probes the ground around a unit, in lengths of a move."""
 
 _SCALAR = {bool: np.bool_, int: np.int64, float: np.float64}
 _NUMBERS = [item.name for item in fields(Settings) if type(item.default) in _SCALAR]

@@ -44,6 +44,7 @@ def calibrate(
         str | None, typer.Option("--map", help="One map; all with targets if absent.")
     ] = None,
     episodes: Annotated[int, typer.Option(min=1)] = 2000,
+    seed: Annotated[int, typer.Option(min=0, max=2**64 - 1, help="Of the first episode.")] = 0,
     as_json: Json = False,
 ) -> None:
     """Compare the simulator with what is published about SMAC v1 on StarCraft II."""
@@ -53,13 +54,19 @@ def calibrate(
     from liir_common.battle.calibrate import calibrate as measure
 
     try:
-        tables = {name: measure(name, episodes) for name in ([map_name] if map_name else TARGETS)}
+        tables = {name: measure(name, episodes, seed) for name in ([map_name] if map_name else TARGETS)}
     except ValueError as error:
         raise ConfigError(str(error)) from None
     if as_json:
         rows = {
             name: [
-                asdict(row.target) | {"measured": row.measured, "difference": row.difference} for row in table
+                asdict(row.target)
+                | {
+                    "measured": row.measured,
+                    "standard_error": row.standard_error,
+                    "difference": row.difference,
+                }
+                for row in table
             ]
             for name, table in tables.items()
         }

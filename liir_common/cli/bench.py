@@ -14,11 +14,17 @@ bench = typer.Typer(no_args_is_help=True, help="Measure speed; medians of CPU ti
 
 
 @bench.command("sim")
-def bench_sim_command(map_name: Map = "3m", as_json: Json = False) -> None:
+def bench_sim_command(
+    map_name: Map = "3m",
+    compile_too: Annotated[
+        bool, typer.Option("--compile", help="Also how long compiling takes, and loading what is compiled.")
+    ] = False,
+    as_json: Json = False,
+) -> None:
     """The simulator alone: uniformly random actions, with observations, states, masks and resets."""
-    from liir_common.battle.bench import bench_sim
+    from liir_common.battle.bench import bench_compile, bench_sim
 
-    print_result(bench_sim(map_name), as_json)
+    print_result(bench_sim(map_name) | (bench_compile(map_name) if compile_too else {}), as_json)
 
 
 @bench.command("rollout")

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from liir_common.battle.env import UnitRecord
+from liir_common.battle.snapshots import UnitRecord
 from liir_common.errors import ConfigError
 from liir_common.figures.run import Battle, Frozen, battles, taken
 from liir_common.files import write_atomic

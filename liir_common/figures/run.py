@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from liir_common import seeds
-from liir_common.battle.env import UnitRecord, parallel_env
+from liir_common.battle.env import parallel_env
+from liir_common.battle.snapshots import UnitRecord
 from liir_common.checkpoint import CheckpointStore, section, unpack
 from liir_common.config import Config, from_tree
 from liir_common.errors import ConfigError

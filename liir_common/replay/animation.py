@@ -8,8 +8,9 @@ from fractions import Fraction
 
 import numpy as np
 
-from liir_common.battle.env import BattleEnv, UnitRecord
+from liir_common.battle.env import BattleEnv
 from liir_common.battle.render import Image, draw_rgb
+from liir_common.battle.snapshots import UnitRecord
 from liir_common.errors import ConfigError
 from liir_common.replay.record import Frame, Recording
 
@@ -18,7 +19,7 @@ _PICTURES_PER_STEP = 8
 _SCALE = 24
 """Pixels per cell; even, since H.264 wants even sizes"""
 _SHOT = 0.5
-"""Share of a step in which its shots are seen"""
+"""Share of a step in which its shots are seen; its blasts are in the rest"""
 _LAST_SECONDS = 1.5
 """How long the end is shown"""
 
@@ -77,10 +78,15 @@ def draw_frames(recording: Recording, per_step: int) -> Iterator[Image]:
         slice((len(pathing.T) - 1 - rows[-1]) * _SCALE, (len(pathing.T) - rows[0]) * _SCALE),
         slice(columns[0] * _SCALE, (columns[-1] + 1) * _SCALE),
     )
-    for before, after, shots in zip(recording.frames, recording.frames[1:], recording.shots, strict=False):
+    steps = zip(recording.frames, recording.frames[1:], recording.shots, recording.blasts, strict=False)
+    for before, after, shots, blasts in steps:
         for share in np.arange(per_step) / per_step:
-            seen = shots if share < _SHOT else ()
-            yield draw_rgb(_between(before, after, share), pathing, seen, _SCALE)[ground]
+            units = _between(before, after, share)
+            if share < _SHOT:
+                image = draw_rgb(units, pathing, shots, scale=_SCALE)
+            else:
+                image = draw_rgb(units, pathing, blasts=blasts, scale=_SCALE)
+            yield image[ground]
     yield draw_rgb(recording.frames[-1], pathing, scale=_SCALE)[ground]
 
 

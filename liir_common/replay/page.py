@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from liir_common.battle.env import BattleEnv, UnitRecord
+from liir_common.battle.env import BattleEnv
 from liir_common.battle.render import LETTERS
+from liir_common.battle.snapshots import UnitRecord
 from liir_common.replay.record import HEALERS, Recording, target_number
 from liir_common.types import Exploration
 
@@ -45,6 +46,7 @@ def page_data(recording: Recording) -> dict[str, Any]:
         "units": [_unit(unit) for unit in recording.frames[0]],
         "frames": [[_situation(unit, n) for unit in frame] for frame in recording.frames],
         "shots": recording.shots,
+        "blasts": [[_rounded(blast, 2) for blast in blasts] for blasts in recording.blasts],
         "actionNames": _ACTIONS,
         "actions": trajectory.actions.tolist(),
         "choices": [[_choices(recording, t, i) for i in range(n)] for t in range(trajectory.length)],
@@ -77,7 +79,8 @@ def _unit(unit: UnitRecord) -> dict[str, Any]:
 def _situation(unit: UnitRecord, n_allies: int) -> list[Any]:
     """x, y, health, shield, energy, cooldown in loops, order, place of the target in the frame or null."""
     numbers = [round(unit[key], 2) for key in ("x", "y", "health", "shield", "energy", "cooldown")]
-    return [*numbers, unit["order"], target_number(unit, n_allies)]
+    heals = unit["unit_type"] in HEALERS and unit["target"] is not None
+    return [*numbers, "heal" if heals else unit["order"], target_number(unit, n_allies)]
 
 
 def _choices(recording: Recording, step: int, agent: int) -> list[list[float]]:

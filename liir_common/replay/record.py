@@ -3,6 +3,7 @@ every decision, and the intrinsic reward of every action it could have taken."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -11,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liir_common import checkpoint
-from liir_common.battle.env import BattleEnv, UnitRecord
+from liir_common.battle.env import BattleEnv
 from liir_common.battle.parameters import resolve
-from liir_common.battle.render import Shot
+from liir_common.battle.render import Blast, Shot
 from liir_common.battle.scenarios import make_battle
-from liir_common.battle.tables import FIRST_ATTACK
+from liir_common.battle.snapshots import UnitRecord
 from liir_common.battle.units import UNIT_TYPES
 from liir_common.checkpoint import Manifest
 from liir_common.config import AlgorithmConfig, EnvConfig
@@ -37,6 +38,8 @@ from liir_common.types import (
 
 HEALERS = frozenset(name for name, unit in UNIT_TYPES.items() if unit.weapon is None)
 """Unit types whose targets are their friends"""
+BLASTS = {name: unit.weapon.blast for name, unit in UNIT_TYPES.items() if unit.weapon and unit.weapon.blast}
+"""How far the unit types reach that burst when they die"""
 Frame = Sequence[UnitRecord]
 """All units at one moment, allies first"""
 
@@ -56,6 +59,8 @@ class Recording:
     """T + 1 of them, as `Trajectory` has observations"""
     shots: Sequence[Sequence[Shot]]
     """T of them: the attacks that began within each step"""
+    blasts: Sequence[Sequence[Blast]]
+    """T of them: the units that burst within each step"""
     trajectory: Trajectory
     probabilities: FloatArray | None
     """[T, n, A], softmax over the available actions, however the action was chosen; None with Q values"""
@@ -109,7 +114,11 @@ def record(
         manifest=manifest,
         pathing=make_battle(map_name, **options)[0].pathing,
         frames=battle.frames,
-        shots=_all_shots(battle.frames, trajectory.actions, resolve(options).step_mul),
+        shots=[
+            find_shots(before, after, aims, resolve(options).step_mul)
+            for before, after, aims in zip(battle.frames, battle.frames[1:], battle.aims, strict=False)
+        ],
+        blasts=[find_blasts(before, after) for before, after in itertools.pairwise(battle.frames)],
         trajectory=trajectory,
         probabilities=None if algorithm.value_based else _softmax(outputs, trajectory.mask[:-1]),
         q_values=np.where(trajectory.mask[:-1], outputs, 0) if algorithm.value_based else None,
@@ -118,16 +127,19 @@ def record(
 
 
 class _WatchedBattle(BattleEnv):
-    """A battle that remembers how all units stood before each step and after the last."""
+    """A battle that remembers how all units stood before each step and after the last, and at whom they had
+    aimed by the end of each step."""
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         result = super().reset(seed, options)
         self.frames = [self.snapshot()]
+        self.aims: list[IntArray] = []
         return result
 
     def step(self, actions: dict[str, Any]) -> Any:
         result = super().step(actions)
         self.frames.append(self.snapshot())
+        self.aims.append(self._battle.units["aim"].copy())
         return result
 
 
@@ -160,27 +172,26 @@ def _intrinsic(manifest: Manifest, tensors: Weights, trajectory: Trajectory) -> 
     return IntrinsicReward.from_checkpoint(manifest, tensors)(trajectory.obs[:-1])
 
 
-def _all_shots(frames: Sequence[Frame], actions: IntArray, loops: int) -> list[list[Shot]]:
-    steps = zip(frames[:-1], frames[1:], actions, strict=True)
-    return [find_shots(before, after, ordered, loops) for before, after, ordered in steps]
+def find_shots(before: Frame, after: Frame, aims: IntArray, loops: int) -> list[Shot]:
+    """Attacks that began in the step of `loops` between two frames.
 
-
-def find_shots(before: Frame, after: Frame, actions: IntArray, loops: int) -> list[Shot]:
-    """Attacks that began in the step of `loops` between two frames in which `actions` [n] were ordered.
-
-    An attack sets the weapon's cooldown, which otherwise only falls; its target is the one ordered, else
-    the one that the unit has or had.
+    An attack sets the weapon's cooldown, which otherwise only falls; `aims` [units] are the targets of the
+    last attacks.
     """
-    n = len(actions)
-    ordered = [n + int(action) - FIRST_ATTACK if action >= FIRST_ATTACK else None for action in actions]
-    shots = []
-    for i, (old, new) in enumerate(zip(before, after, strict=True)):
-        if new["cooldown"] > max(0.0, old["cooldown"] - loops):
-            targets = (ordered[i] if i < n else None, target_number(new, n), target_number(old, n))
-            target = next((target for target in targets if target is not None), None)
-            if target is not None:
-                shots.append(Shot(i, target))
-    return shots
+    return [
+        Shot(i, int(aims[i]))
+        for i, (old, new) in enumerate(zip(before, after, strict=True))
+        if new["cooldown"] > max(0.0, old["cooldown"] - loops)
+    ]
+
+
+def find_blasts(before: Frame, after: Frame) -> list[Blast]:
+    """Of the units that died between two frames those that burst, where they did: the dead do not move."""
+    return [
+        Blast(new["x"], new["y"], BLASTS[new["unit_type"]])
+        for old, new in zip(before, after, strict=True)
+        if old["alive"] and not new["alive"] and new["unit_type"] in BLASTS
+    ]
 
 
 def target_number(unit: UnitRecord, n_allies: int) -> int | None:

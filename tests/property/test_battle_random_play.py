@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -10,6 +12,7 @@ from hypothesis import strategies as st
 from liir_common.battle.engine import STEPS
 from liir_common.battle.env import BattleEnv, parallel_env
 from liir_common.battle.scenarios import SCENARIOS
+from tests.unit.test_battle_observation import Reference
 
 # The return is then what was taken from the enemies, and 10 for each of them.
 DAMAGE = {
@@ -21,6 +24,9 @@ DAMAGE = {
 ENVS = {name: parallel_env(name, **DAMAGE) for name in SCENARIOS}
 
 
+REFERENCES = {name: Reference(name, {}) for name in SCENARIOS}
+
+
 def check_units(env: BattleEnv) -> None:
     for unit, spec in zip(env.snapshot(), env._tables.specs, strict=True):
         assert 0 <= unit["health"] <= unit["health_max"]
@@ -29,6 +35,18 @@ def check_units(env: BattleEnv) -> None:
         assert 0 <= unit["energy"] <= 200
         assert env._tables.layers[spec["layer"], int(unit["x"]), int(unit["y"])]
         assert np.isfinite([unit["x"], unit["y"], unit["cooldown"]]).all()
+
+
+def check_dead(env: BattleEnv, dead: Any, x: Any, y: Any, before: Any) -> None:
+    """Units that were dead a step ago are so still, have not moved, and have begun nothing."""
+    after = env._battle.units[dead]
+    assert not after["alive"].any()
+    assert np.array_equal((env._battle.x[dead], env._battle.y[dead]), (x, y))
+    for name in ("health", "shield", "ready_at", "hit_at", "aim"):
+        assert np.array_equal(after[name], before[name])
+    assert (after["hits"] == 0).all()
+    flying = after["missile_target"] >= 0
+    assert np.array_equal(after["missile_target"][flying], before["missile_target"][flying])
 
 
 def vitality(env: BattleEnv, team: str) -> float:
@@ -44,7 +62,8 @@ def test_invariants(map_name: str, seed: int, bold: bool) -> None:
     total, limit = 0.0, int(env._tables.rules["limit"][0])
     started_with = vitality(env, "enemy")
     for _ in range(limit):
-        dead = {(u["team"], u["id"]): (u["x"], u["y"]) for u in env.snapshot() if not u["alive"]}
+        dead = np.flatnonzero(~env._battle.units["alive"])
+        before = env._battle.x[dead], env._battle.y[dead], env._battle.units[dead]
         actions = {}
         for agent in env.agents:
             available = np.flatnonzero(observations[agent]["action_mask"])
@@ -52,12 +71,10 @@ def test_invariants(map_name: str, seed: int, bold: bool) -> None:
         observations, rewards, terminated, truncated, infos = env.step(actions)
         total += rewards["ally_0"]
         check_units(env)
-        for unit in env.snapshot():
-            key = (unit["team"], unit["id"])
-            if key in dead:
-                assert not unit["alive"], "the dead stay dead"
-                assert (unit["x"], unit["y"]) == dead[key], "and do not move"
-        for agent, observation in observations.items():
+        check_dead(env, dead, *before)
+        units = env.snapshot()
+        for i, (agent, observation) in enumerate(observations.items()):
+            assert observation["action_mask"].tolist() == REFERENCES[map_name].mask(units[i], units)
             assert np.isfinite(observation["observation"]).all()
             assert np.abs(observation["observation"]).max() <= 1
             assert observation["action_mask"].any()

@@ -10,11 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from liir_common.battle.env import BattleEnv, UnitRecord, parallel_env
+from liir_common.battle import scenarios
+from liir_common.battle.env import BattleEnv, parallel_env
 from liir_common.battle.parameters import Parameters, Settings
 from liir_common.battle.policies import CLOSEST_ENEMY, RANDOM, STAND
 from liir_common.battle.policies import play as play_policy
 from liir_common.battle.scenarios import make_battle
+from liir_common.battle.snapshots import UnitRecord
 from liir_common.battle.terrain import MAP_SIZE, TERRAINS, routes
 
 STOP, NORTH, SOUTH, EAST, WEST, ATTACK = range(1, 7)
@@ -80,13 +82,25 @@ def test_the_first_move_loses_the_latency(latency: int) -> None:
     assert unit(env, "ally", 0)["x"] == pytest.approx(15 + (8 - latency) * 2.25 / 16)
 
 
-def test_walls_hold_and_are_slid_along() -> None:
-    env = parallel_env("3m")
-    stage(env, {("ally", 0): {"x": 15.0, "y": 24.2}, ("enemy", 0): {"x": 29.0, "y": 8.0}})
+def test_walls_hold() -> None:
+    """A stalker walks 1.29 in its first step, and the open ground ends at 30."""
+    env = parallel_env("3s_vs_3z")
+    stage(env, {("ally", 0): {"x": 15.0, "y": 29.2}, ("enemy", 0): FAR})
     assert not env._masks[0, NORTH]
-    stage(env, {("ally", 0): {"x": 29.5, "y": 23.9}, ("enemy", 0): {"x": 2.5, "y": 8.0}})
-    play(env, {0: NORTH}, steps=1)
-    assert 24 < unit(env, "ally", 0)["y"] < 25
+    stage(env, {("ally", 0): {"x": 15.0, "y": 28.95}, ("enemy", 0): FAR})
+    play(env, {0: NORTH})
+    assert 30 - 2.9531 / 16 <= unit(env, "ally", 0)["y"] < 30
+
+
+def test_walls_are_slid_along() -> None:
+    """The goal is as far beyond the wall at 25 as it is eastward; that part of the way is walked."""
+    env = parallel_env("3m")
+    aslant = {"x": 15.0, "y": 24.9, "order": "move", "goal_x": 23.0, "goal_y": 32.9}
+    stage(env, {("ally", 0): {"x": 3.0, "y": 8.0}, ("enemy", 0): aslant})
+    play(env, {}, steps=3)
+    walker = unit(env, "enemy", 0)
+    assert 24.9 <= walker["y"] < 25
+    assert walker["x"] > 17
 
 
 def test_an_order_beyond_the_weapon_walks_up_and_fires() -> None:
@@ -166,6 +180,58 @@ def test_missiles_take_time() -> None:
     assert unit(env, "ally", 0)["cooldown"] > 0
     play(env, {0: STOP})
     assert unit(env, "enemy", 0)["shield"] == 50 - 13
+
+
+@pytest.mark.parametrize(("redirects", "hurt"), [(False, 0), (True, 13)])
+def test_a_missile_is_lost_with_its_target(redirects: bool, hurt: int) -> None:
+    """Two stalkers fire at a point of life: the second shot costs its cooldown, and hits nobody unless told
+    to fly on."""
+    env = parallel_env("3s_vs_3z", redirect_missiles=redirects)
+    stage(
+        env,
+        {
+            ("ally", 0): {"x": 10.0, "y": 15.0},
+            ("ally", 1): {"x": 10.0, "y": 17.0},
+            ("enemy", 0): {"x": 15.0, "y": 16.0, "health": 1.0, "shield": 0.0},
+            ("enemy", 1): {"x": 17.0, "y": 16.0},
+        },
+    )
+    play(env, {0: ATTACK, 1: ATTACK}, steps=2)
+    assert not unit(env, "enemy", 0)["alive"]
+    assert unit(env, "enemy", 1)["shield"] == 50 - hurt
+    assert all(unit(env, "ally", i)["cooldown"] > 10 for i in range(2))
+
+
+@pytest.mark.parametrize(("from_release", "windup"), [(False, 0.0), (True, 0.167 * 16)])
+def test_the_cooldown_starts_with_the_attack_or_at_its_damage_point(
+    from_release: bool, windup: float
+) -> None:
+    """A stalker's attacks are 1.87 s and a delay of -1 to 2 loops apart, and half a loop of waiting."""
+    env = parallel_env("3s_vs_3z", step_mul=1, order_latency=0, cooldown_from_release=from_release)
+    env._tables.rules["limit"] = 10_000
+    stage(env, {("ally", 0): {"x": 10.0, "y": 15.0}, ("enemy", 0): {"x": 14.0, "y": 15.0}})
+    fired, before = [], 0.0
+    for loop in range(9000):
+        play(env, {0: ATTACK})
+        after = unit(env, "ally", 0)["cooldown"]
+        if after > before:
+            fired.append(loop)
+        before = after
+        env._battle.units["health"][3] = 100.0
+    # The standard deviation of an interval is 0.9 loops.
+    assert np.diff(fired).mean() == pytest.approx(1.87 * 16 + 0.5 + 0.5 + windup, abs=0.3)
+
+
+@pytest.mark.parametrize("from_release", [False, True])
+def test_an_attack_interrupted_before_its_hit_is_free_if_the_cooldown_starts_there(
+    from_release: bool,
+) -> None:
+    env = parallel_env("3s_vs_3z", step_mul=2, order_latency=0, cooldown_from_release=from_release)
+    stage(env, {("ally", 0): {"x": 10.0, "y": 15.0}, ("enemy", 0): {"x": 14.0, "y": 15.0}})
+    play(env, {0: ATTACK})
+    play(env, {0: STOP}, steps=3)
+    assert unit(env, "enemy", 0)["shield"] == 50
+    assert (unit(env, "ally", 0)["cooldown"] == 0) is from_release
 
 
 @pytest.mark.parametrize(("cancels", "lost"), [(True, 8), (False, 16)])
@@ -322,6 +388,29 @@ def test_idle_friends_are_pushed_aside(pushes: bool, moved: bool) -> None:
     assert (unit(env, "ally", 1)["x"] > 11.1) is moved
 
 
+def test_six_zealots_surround_one_and_a_seventh_waits(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Six equal discs fit around another, and a zealot reaches 0.1 beyond touching."""
+    crowd = scenarios._facing("7z_vs_1z", {"zealot": 7}, {"zealot": 1}, limit=60)
+    monkeypatch.setitem(scenarios.SCENARIOS, "7z_vs_1z", crowd)  # type: ignore[arg-type]
+    env = parallel_env("7z_vs_1z")
+    ring = {
+        ("ally", k): {"x": 15 + 1.05 * math.cos(k * math.pi / 3), "y": 15 + 1.05 * math.sin(k * math.pi / 3)}
+        for k in range(6)
+    }
+    stage(env, {**ring, ("ally", 6): {"x": 18.0, "y": 15.4}, ("enemy", 0): {"x": 15.0, "y": 15.0}})
+    for _ in range(6):
+        play(env, dict.fromkeys(range(7), ATTACK))
+        env._battle.units["health"][7] = 100.0
+        assert unit(env, "ally", 6)["cooldown"] == 0
+    assert all(unit(env, "ally", k)["cooldown"] > 0 for k in range(6))
+    assert 1.1 < distance(unit(env, "ally", 6), unit(env, "enemy", 0)) < 2.5
+    records = env.snapshot()
+    records[0] |= {"alive": False, "health": 0.0, "shield": 0.0}
+    env.restore(records)
+    play(env, dict.fromkeys(range(7), ATTACK), steps=2)
+    assert unit(env, "ally", 6)["cooldown"] > 0, "there is room for it now"
+
+
 def test_enemies_walk_to_the_goal_in_formation() -> None:
     env = parallel_env("3m")
     env.reset(seed=2)
@@ -434,6 +523,18 @@ def test_marauders_cannot_hit_what_flies_and_marines_can() -> None:
     stage(env, {("ally", 2): {"x": 10.0, "y": 15.0}, ("enemy", MEDIVAC): flying, ("enemy", 0): FAR})
     play(env, {2: ATTACK + MEDIVAC})
     assert unit(env, "enemy", MEDIVAC)["health"] == 150.0 - 5
+
+
+def test_an_attack_on_what_flies_is_no_order_for_a_marauder() -> None:
+    """It goes on with what it did before."""
+    env = parallel_env("MMM")
+    flying = {"x": 14.0, "y": 15.0}
+    stage(env, {("ally", 0): {"x": 10.0, "y": 15.0}, ("enemy", MEDIVAC): flying, ("enemy", 0): FAR})
+    play(env, {0: NORTH})
+    play(env, {0: ATTACK + MEDIVAC})
+    marauder = unit(env, "ally", 0)
+    assert (marauder["order"], marauder["target"]) == ("move", None)
+    assert marauder["y"] == 17.0, "where the first order led"
 
 
 @pytest.mark.parametrize(

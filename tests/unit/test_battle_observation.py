@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from liir_common.battle.env import BattleEnv, UnitRecord, battle_spec, parallel_env
-from liir_common.battle.scenarios import SCENARIOS
+from liir_common.battle.env import BattleEnv, battle_spec, parallel_env
+from liir_common.battle.scenarios import SCENARIOS, describe
+from liir_common.battle.snapshots import UnitRecord
 from liir_common.battle.terrain import TERRAINS
 
 SIGHT, SHOOT_RANGE = 9.0, 6.0
@@ -55,6 +56,7 @@ OPTIONS: tuple[dict[str, Any], ...] = (
     {"state_last_action": False, "state_timestep_number": True},
     {"obs_last_action": True, "obs_timestep_number": True, "obs_pathing_grid": True},
     {"obs_terrain_height": True, "obs_pathing_grid": True, "move_amount": 5.0},
+    {"obs_terrain_height": True, "obs_pathing_grid": True, "move_amount": 1.25},
     {"obs_all_health": False},
     {"obs_all_health": False, "obs_own_health": False, "obs_instead_of_state": True},
 )
@@ -126,11 +128,14 @@ class Reference:
         mask = self.mask(me, units)
         values = [float(v) for v in mask[2:6]]
         x, y = int(me["x"]), int(me["y"])
-        around = [(0, 4), (0, -4), (4, 0), (-4, 0), (2, 2), (-2, -2), (2, -2), (-2, 2)]
+        far, near = 2 * self.options["move_amount"], self.options["move_amount"]
+        steps = [(0, far), (0, -far), (far, 0), (-far, 0)]
+        steps += [(near, near), (-near, -near), (near, -near), (-near, near)]
+        around = [(int(x + dx), int(y + dy)) for dx, dy in steps]
         if self.options["obs_pathing_grid"]:
-            values += [float(self.is_open(x + dx, y + dy, True)) for dx, dy in around]
+            values += [float(self.is_open(*place, True)) for place in around]
         if self.options["obs_terrain_height"]:
-            values += [self.height(x + dx, y + dy) for dx, dy in [*around, (0, 0)]]
+            values += [self.height(*place) for place in [*around, (x, y)]]
         for j, enemy in enumerate(enemies):
             values += self.seen(me, enemy, float(mask[6 + j]), [])
         for j, ally in enumerate(allies):
@@ -210,6 +215,25 @@ def test_layout(map_name: str, options: dict[str, Any]) -> None:
         np.testing.assert_allclose(env.state(), wanted, atol=1e-6)
 
 
+def test_an_attack_wants_6_at_most_and_sight_less_than_9() -> None:
+    """From centre to centre, to the last bit."""
+    env = parallel_env("3m")
+    for x, available, visible in [
+        (16.0, True, True),
+        (np.nextafter(16.0, 17.0), False, True),
+        (np.nextafter(19.0, 18.0), False, True),
+        (19.0, False, False),
+    ]:
+        env.reset(seed=0)
+        records = env.snapshot()
+        records[0] |= {"x": 10.0, "y": 15.0}
+        records[3] |= {"x": float(x), "y": 15.0}
+        env.restore(records)
+        seen = env._observations()["ally_0"]
+        assert seen["action_mask"][6] == available
+        assert seen["observation"][4:9].any() == visible
+
+
 @pytest.mark.parametrize(
     ("map_name", "n_actions", "obs", "state", "state_without"),
     [
@@ -244,6 +268,39 @@ def test_sizes_are_those_of_smac(
     spec = battle_spec(map_name)
     assert (spec.n_actions, spec.obs_dim, spec.state_dim) == (n_actions, obs, state)
     assert battle_spec(map_name, state_last_action=False).state_dim == state_without
+
+
+# Limit, then who fights whom, as SMAC v1's registry and map scripts have them.
+MAPS: dict[str, tuple[int, dict[str, int], dict[str, int]]] = {
+    "3m": (60, {"marine": 3}, {"marine": 3}),
+    "8m": (120, {"marine": 8}, {"marine": 8}),
+    "25m": (150, {"marine": 25}, {"marine": 25}),
+    "5m_vs_6m": (70, {"marine": 5}, {"marine": 6}),
+    "8m_vs_9m": (120, {"marine": 8}, {"marine": 9}),
+    "10m_vs_11m": (150, {"marine": 10}, {"marine": 11}),
+    "27m_vs_30m": (180, {"marine": 27}, {"marine": 30}),
+    "MMM": (150, {"marine": 7, "marauder": 2, "medivac": 1}, {"marine": 7, "marauder": 2, "medivac": 1}),
+    "MMM2": (180, {"marine": 7, "marauder": 2, "medivac": 1}, {"marine": 8, "marauder": 3, "medivac": 1}),
+    "2s3z": (120, {"stalker": 2, "zealot": 3}, {"stalker": 2, "zealot": 3}),
+    "3s5z": (150, {"stalker": 3, "zealot": 5}, {"stalker": 3, "zealot": 5}),
+    "3s5z_vs_3s6z": (170, {"stalker": 3, "zealot": 5}, {"stalker": 3, "zealot": 6}),
+    "3s_vs_3z": (150, {"stalker": 3}, {"zealot": 3}),
+    "3s_vs_4z": (200, {"stalker": 3}, {"zealot": 4}),
+    "3s_vs_5z": (250, {"stalker": 3}, {"zealot": 5}),
+    "1c3s5z": (180, {"colossus": 1, "stalker": 3, "zealot": 5}, {"colossus": 1, "stalker": 3, "zealot": 5}),
+    "2m_vs_1z": (150, {"marine": 2}, {"zealot": 1}),
+    "corridor": (400, {"zealot": 6}, {"zergling": 24}),
+    "6h_vs_8z": (150, {"hydralisk": 6}, {"zealot": 8}),
+    "2s_vs_1sc": (300, {"stalker": 2}, {"spine_crawler": 1}),
+    "so_many_baneling": (100, {"zealot": 7}, {"baneling": 32}),
+    "bane_vs_bane": (200, {"zergling": 20, "baneling": 4}, {"zergling": 20, "baneling": 4}),
+    "2c_vs_64zg": (400, {"colossus": 2}, {"zergling": 64}),
+}
+
+
+def test_maps_are_those_of_smac() -> None:
+    listed = {name: describe(scenario) for name, scenario in SCENARIOS.items()}
+    assert {name: (row["limit"], row["agents"], row["enemies"]) for name, row in listed.items()} == MAPS
 
 
 @pytest.mark.parametrize("map_name", SCENARIOS)

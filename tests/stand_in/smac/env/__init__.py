@@ -23,8 +23,12 @@ class StarCraft2Env:
         state_last_action: bool = True,
         reward_only_positive: bool = True,
         reward_sparse: bool = False,
+        obs_timestep_number: bool = False,
+        obs_instead_of_state: bool = False,
     ) -> None:
         rules = {
+            "obs_timestep_number": obs_timestep_number,
+            "obs_instead_of_state": obs_instead_of_state,
             "state_last_action": state_last_action,
             "reward_only_positive": reward_only_positive,
             "reward_sparse": reward_sparse,
@@ -34,14 +38,18 @@ class StarCraft2Env:
         except ValueError:
             raise KeyError(map_name) from None
         self._battle = BattleEnv(map_name, **rules)
+        self._rules = rules
         self._continuing = continuing_episode
         self._seed = seed
         self._episode_count = 0
 
     def get_env_info(self) -> dict[str, int]:
+        # The step's number is counted once, and takes two places.
+        obs_shape = self._spec.obs_dim - self._rules["obs_timestep_number"]
+        whole = self._rules["obs_instead_of_state"]
         return {
-            "state_shape": self._spec.state_dim,
-            "obs_shape": self._spec.obs_dim,
+            "state_shape": self._spec.n_agents * obs_shape if whole else self._spec.state_dim,
+            "obs_shape": obs_shape,
             "n_actions": self._spec.n_actions,
             "n_agents": self._spec.n_agents,
             "episode_limit": self._spec.episode_limit,
@@ -61,12 +69,7 @@ class StarCraft2Env:
         )
         self._look(observations)
         first, truncated = infos[agents[0]], truncations[agents[0]]
-        dead = [unit["team"] for unit in self._battle.snapshot() if not unit["alive"]]
-        info = {
-            "battle_won": bool(first.get("won", False)),
-            "dead_allies": dead.count("ally"),
-            "dead_enemies": dead.count("enemy"),
-        }
+        info = {key: first[key] for key in ("battle_won", "dead_allies", "dead_enemies")}
         if truncated and self._continuing:
             info["episode_limit"] = True
         return rewards[agents[0]], terminations[agents[0]] or truncated, info

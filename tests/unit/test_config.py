@@ -138,6 +138,7 @@ def test_security_names_files_wherever_it_is_set_and_is_not_shared(
         ("algorithm.replay.episodes=31", "batch_episodes wants to be at most episodes (31), got 32"),
         ("algorithm={name: coma, limit_is_terminal: false}", "coma wants limit_is_terminal"),
         ("seed", "--set wants key.sub=value, got 'seed'"),
+        ("_file.seed=1", "--set wants key.sub=value, got '_file.seed=1'"),
         ("seed=[", "not YAML"),
     ],
 )
@@ -154,9 +155,20 @@ def test_unreadable_files_are_explained(tmp_path: Path) -> None:
     bad.write_text("- a\n- b\n")
     with pytest.raises(ConfigError, match="wanted a mapping"):
         config.load(bad)
+    bad.write_text("1: 2")
+    with pytest.raises(ConfigError, match=r"wanted a mapping of settings by name, got keys \[1\]"):
+        config.load(bad)
     bad.write_text("a: [")
     with pytest.raises(ConfigError, match="not YAML"):
         config.load(bad)
+
+
+def test_misspelt_variables_are_explained(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("LIIR_TOKENS", "reader secret")
+    config.load()
+    monkeypatch.setenv("LIIR_TRAININGS__LAG", "1")
+    with pytest.raises(ConfigError, match=r"variable LIIR_TRAININGS__LAG; did you mean LIIR_TRAINING\?"):
+        config.load()
 
 
 def test_exploration_falls_linearly_and_stays() -> None:

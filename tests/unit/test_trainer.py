@@ -8,11 +8,12 @@ import pytest
 import torch
 
 from liir_common import config, metrics
+from liir_common.errors import CorruptError
 from liir_common.types import Weights
 from services.learner.algorithms import make_algorithm
 from services.learner.intake import Opening
 from services.learner.run_directory import RunDirectory
-from services.learner.trainer import Trainer
+from services.learner.trainer import Progress, Trainer
 from tests.samples import SPEC, make_trajectory
 
 BATCH = 4
@@ -154,3 +155,19 @@ def test_the_replay_on_disk_is_what_the_kept_states_need(tmp_path: Path) -> None
 def test_a_run_says_whether_its_checkpoints_are_to_be_tested(tmp_path: Path, enabled: bool) -> None:
     Played(tmp_path, 1, f"evaluation.enabled={enabled}")
     assert metrics.LEARNER.get_sample_value("liir_evaluation_enabled") == enabled
+
+
+def test_a_state_that_does_not_fit_is_an_error_that_says_so(tmp_path: Path) -> None:
+    Played(tmp_path, 2).train()
+    with pytest.raises(CorruptError, match="the state of step 2 fits no liir of this build"):
+        Played(tmp_path, 4, "algorithm.policy_hidden=9")
+
+
+def test_the_rate_falls_when_nothing_comes(monkeypatch: pytest.MonkeyPatch) -> None:
+    progress = Progress()
+    progress.recent.extend([(10.0, 0), (11.0, 100), (12.0, 200)])
+    now = 12.9
+    monkeypatch.setattr("services.learner.trainer.time.monotonic", lambda: now)
+    assert progress.env_steps_per_second == 100  # the next is not late yet
+    now = 15.0
+    assert progress.env_steps_per_second == 200 / 4

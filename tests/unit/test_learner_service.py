@@ -1,0 +1,27 @@
+"""What fails on the learner's event loop."""
+
+import asyncio
+
+import pytest
+
+from services.learner.service import _first_of, _OnLoop
+
+
+async def fails() -> None:
+    await asyncio.sleep(0)
+    raise RuntimeError("broken")
+
+
+def fails_at_once() -> None:
+    raise RuntimeError("broken")
+
+
+@pytest.mark.parametrize("work", [fails, fails_at_once])
+def test_work_of_another_thread_that_fails_on_the_loop_ends_the_service(work: object) -> None:
+    async def serve() -> None:
+        on_loop = _OnLoop(asyncio.get_running_loop())
+        await asyncio.to_thread(on_loop, work)
+        await asyncio.wait_for(_first_of(asyncio.Event().wait(), on_loop.failure), timeout=10)
+
+    with pytest.raises(RuntimeError, match="broken"):
+        asyncio.run(serve())

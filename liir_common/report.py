@@ -118,7 +118,7 @@ def curve_labels(configs: Sequence[Mapping[str, Any]]) -> list[str]:
     labels = []
     for method, map_name, own in zip(methods, maps, settings, strict=True):
         alike = [other for name, other in zip(methods, settings, strict=True) if name == method]
-        apart = [f"{key} {own[key]}" for key in own if any(o[key] != own[key] for o in alike)]
+        apart = [f"{key} {own[key]}" for key in own if any(o.get(key, own[key]) != own[key] for o in alike)]
         labels.append(", ".join([map_name, method, *apart] if len(set(maps)) > 1 else [method, *apart]))
     return labels
 

@@ -52,7 +52,8 @@ def test_a_learner_a_hundred_times_slower_than_its_actors_does_not_grow(tmp_path
             while time.monotonic() < deadline:
                 memory.append(psutil.Process(learner.pid).memory_info().rss)
                 assert training.status().tickets_outstanding <= (LAG + 1) * BATCH
-                assert scrape(log)["liir_batches_waiting"] <= LAG
+                # An update opens a batch as soon as it has moved the policy.
+                assert scrape(log)["liir_batches_waiting"] <= LAG + 1
                 time.sleep(0.25)
             status = training.status()
         assert status.learner_step > begin

@@ -432,6 +432,16 @@ def leaves(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
+def differences(kept: Mapping[str, Any], wanted: Mapping[str, Any]) -> dict[str, str]:
+    """What two trees say differently, in words, by dotted key; None is said where a key is missing."""
+    there, here = leaves(kept), leaves(wanted)
+    return {
+        key: f"{key}: {there.get(key)!r} there, {here.get(key)!r} wanted"
+        for key in there | here
+        if there.get(key) != here.get(key)
+    }
+
+
 def load(path: Path | None = None, settings: Sequence[str] = ()) -> Config:
     """Read a YAML file and lay `key.sub=value` settings over it.
 

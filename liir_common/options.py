@@ -74,12 +74,8 @@ def load_run_config(
 
 
 def _check_same_run(kept: Config, resumed: Config, run_dir: Path) -> None:
-    before, after = (config.leaves(each.tree()) for each in (kept, resumed))
-    changed = [
-        f"{key}: {before.get(key)!r} there, {after.get(key)!r} wanted"
-        for key in before | after
-        if before.get(key) != after.get(key) and not key.startswith(_MAY_CHANGE)
-    ]
+    differ = config.differences(kept.tree(), resumed.tree())
+    changed = [text for key, text in differ.items() if not key.startswith(_MAY_CHANGE)]
     if changed:
         raise ConfigError(
             f"{run_dir} was begun with other settings ({'; '.join(changed)}); a resumed run may change only "

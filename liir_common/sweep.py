@@ -17,7 +17,6 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
-from operator import getitem
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -26,7 +25,7 @@ import yaml
 from pydantic import Field, ValidationError
 
 from liir_common import results
-from liir_common.config import Config, Section, from_tree, merge, parse_settings
+from liir_common.config import Config, Section, differences, from_tree, merge, parse_settings
 from liir_common.errors import ConfigError
 from liir_common.files import csv_text, read_table, write_atomic
 from liir_common.launch import die_with_parent
@@ -38,8 +37,8 @@ _FREE_PORTS = {
     "actors": {"metrics_port": 0},
     "evaluation": {"metrics_port": 0},
 }
-_TAKEN_ANEW = ("actors", "learner", "training.total_env_steps")
-"""What a run takes anew when it goes on: where it runs, maybe another machine, and how far."""
+_WHERE_IT_RUNS = ("actors", "learner")
+"""Sections that a run takes anew when it goes on, maybe on another machine."""
 
 
 class SweepConfig(Section):
@@ -207,8 +206,9 @@ class Sweep:
     def _command(self, run: Run, resumed: bool) -> list[str]:
         tree, config = run.config.tree(), self._output / "configs" / f"{run.name}.yaml"
         write_atomic(config, yaml.safe_dump(tree, sort_keys=False).encode())
-        anew = {key: json.dumps(reduce(getitem, key.split("."), tree)) for key in _TAKEN_ANEW}
-        settings = [part for key, value in anew.items() for part in ("--set", f"{key}={value}")]
+        anew = {key: tree[key] for key in _WHERE_IT_RUNS}
+        anew["training"] = {"total_env_steps": run.config.training.total_env_steps}
+        settings = [part for key, value in anew.items() for part in ("--set", f"{key}={json.dumps(value)}")]
         source = ["--resume", *settings] if resumed else ["--config", str(config)]
         return [
             sys.executable,
@@ -272,18 +272,13 @@ class Sweep:
         kept = self._output / run.name / "config.yaml"
         if not kept.exists():
             return
-        tree = yaml.safe_load(kept.read_text(encoding="utf-8"))
-        there, wanted = results.what_matters(tree), results.what_matters(run.config.tree())
-        differ = [
-            f"{section}.{key}: {there[section].get(key)!r} there, {value!r} wanted"
-            for section, values in wanted.items()
-            for key, value in values.items()
-            if there[section].get(key) != value
-            and not (key == "total_env_steps" and value > there[section][key])  # goes on
-        ]
+        there = from_tree(yaml.safe_load(kept.read_text(encoding="utf-8")))
+        differ = differences(results.what_matters(there.tree()), results.what_matters(run.config.tree()))
+        if run.config.training.total_env_steps > there.training.total_env_steps:
+            del differ["training.total_env_steps"]  # the run goes on
         if differ:
             raise ConfigError(
-                f"{kept.parent} was trained with other settings ({'; '.join(differ)}); name another "
+                f"{kept.parent} was trained with other settings ({'; '.join(differ.values())}); name another "
                 "--output, or move it away to train anew"
             )
 

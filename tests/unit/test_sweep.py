@@ -146,3 +146,15 @@ def test_only_a_larger_budget_belongs_to_a_run_that_is_there(sweep: Path, tmp_pa
     Sweep(plan(sweep, ["liir"], ["3m"], [1], ["training.total_env_steps=1001"]), tmp_path / "out")
     with pytest.raises(ConfigError, match=r"training\.total_env_steps: 1000 there, 999 wanted"):
         Sweep(plan(sweep, ["liir"], ["3m"], [1], ["training.total_env_steps=999"]), tmp_path / "out")
+
+
+def test_a_run_of_an_older_build_is_compared_with_the_defaults_of_what_it_did_not_know(
+    sweep: Path, tmp_path: Path
+) -> None:
+    folder = make_run(
+        tmp_path / "out/3m-liir-seed1", "algorithm.entropy=0.02", "algorithm.gamma=0.9", episodes=()
+    )
+    tree = yaml.safe_load((folder / "config.yaml").read_text())
+    del tree["algorithm"]["ratio_bound"]
+    (folder / "config.yaml").write_text(yaml.safe_dump(tree))
+    Sweep(plan(sweep, ["liir"], ["3m"], [1]), tmp_path / "out")

@@ -219,7 +219,7 @@ class ActorsConfig(Section):
     send_security: bool = False
     """Send the files of `security` to the actors through Ray; otherwise every node has them in its place."""
     compress: bool = False
-    """Pack trajectories with zstd: a gain on slow links only."""
+    """Pack trajectories with zstd, for slow links: smaller than the changes of each step, and slower."""
     ticket_timeout_s: float = Field(120.0, gt=0)
     """A ticket that has not come back by then is given to another actor as well."""
     metrics_port: int = Field(9102, ge=0, le=65535)

@@ -25,11 +25,15 @@ def make_trajectory(
     shape = (length + 1, spec.n_agents)
     mask = random.random((*shape, spec.n_actions)) < 0.5
     mask[..., 1] = True
+    obs = random.standard_normal((*shape, spec.obs_dim)).astype(np.float32)
+    state = random.standard_normal((length + 1, spec.state_dim)).astype(np.float32)
+    for repeating in (obs, state):
+        repeating[1::2] = repeating[:-1:2]  # as most of a battle does
     return Trajectory(
         episode_id=episode_id,
         policy_version=version,
-        obs=random.standard_normal((*shape, spec.obs_dim)).astype(np.float32),
-        state=random.standard_normal((length + 1, spec.state_dim)).astype(np.float32),
+        obs=obs,
+        state=state,
         mask=mask,
         alive=np.ones(shape, np.bool_),
         actions=np.ones((length, spec.n_agents), np.int16),

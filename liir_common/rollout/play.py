@@ -11,6 +11,7 @@ from liir_common import seeds
 from liir_common.battle.env import battle_spec, parallel_env
 from liir_common.config import EnvConfig
 from liir_common.errors import ConfigError
+from liir_common.rollout import changes
 from liir_common.rollout.fused import FusedPlayer
 from liir_common.rollout.loop import Env, LoopPlayer, loop_spec
 from liir_common.rollout.player import Player
@@ -79,8 +80,9 @@ def _made_by_factory(env: EnvConfig) -> Env:
 
 
 def warm_up(env: EnvConfig) -> None:
-    """Compile all that playing `env` needs, into numba's cache, by playing one episode."""
+    """Compile all that playing `env` and sending it needs, into numba's cache, by playing one episode."""
     player = make_player(env)
     player.load(random_weights(player.spec, hidden=64, seed=0))
     seed = seeds.episode_seed(0, seeds.EVALUATION, 0)
-    player.play(Ticket(0, 0, seed, Exploration.SOFTMAX_FLOOR, epsilon=0.5))
+    trajectory = player.play(Ticket(0, 0, seed, Exploration.SOFTMAX_FLOOR, epsilon=0.5))
+    changes.pack(trajectory.obs)

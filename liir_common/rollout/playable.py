@@ -11,6 +11,7 @@ from liir_common.types import EnvSpec, Trajectory
 kernel_cache.install()
 
 _PLAYABLE, _POSITIVE, _STUCK, _OUT_OF_RANGE, _FORBIDDEN = range(5)
+_FIGURES = ("obs", "state", "log_mu", "reward")
 _EXPONENT = np.uint32(0x7F800000)
 """These bits of a float32 are all ones if it is infinite or NaN."""
 
@@ -24,11 +25,10 @@ def check_playable(trajectory: Trajectory, spec: EnvSpec) -> None:
     """
     if not (trajectory.terminated or trajectory.truncated):
         raise ValueError("trajectory: wanted terminated or truncated, got neither")
-    for name in ("obs", "state", "log_mu", "reward"):
-        if not _all_finite(getattr(trajectory, name).reshape(-1).view(np.uint32)):
-            raise ValueError(f"{name}: wanted finite numbers, got NaN or infinity")
     if not all(map(math.isfinite, trajectory.info.values())):
         raise ValueError("info: wanted finite numbers, got NaN or infinity")
+    if fault := _first_infinite(*(getattr(trajectory, name).view(np.uint32) for name in _FIGURES)):
+        raise ValueError(f"{_FIGURES[fault - 1]}: wanted finite numbers, got NaN or infinity")
     fault, step, agent = _first_fault(trajectory.mask, trajectory.actions, trajectory.log_mu)
     where = f"agent {agent} at step {step}"
     if fault == _POSITIVE:
@@ -39,6 +39,18 @@ def check_playable(trajectory: Trajectory, spec: EnvSpec) -> None:
         raise ValueError(f"actions: wanted 0..{spec.n_actions - 1}, {where} has another")
     if fault == _FORBIDDEN:
         raise ValueError(f"actions: {where} took an action that its mask forbids")
+
+
+@njit(cache=True, nogil=True)
+def _first_infinite(obs, state, log_mu, reward):
+    """The number, from 1 on, of the first array that has an infinity or NaN among these bits, else 0."""
+    if not _all_finite(obs.reshape(-1)):
+        return 1
+    if not _all_finite(state.reshape(-1)):
+        return 2
+    if not _all_finite(log_mu.reshape(-1)):
+        return 3
+    return 0 if _all_finite(reward) else 4
 
 
 @njit(cache=True, nogil=True)

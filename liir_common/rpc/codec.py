@@ -5,12 +5,14 @@ Every function that decodes raises `ValueError` with what was wanted and what ca
 
 import math
 from collections.abc import Mapping
+from functools import cache
 
 import numpy as np
 import zstandard
 from numpy.typing import NDArray
 
 from liir_common import types
+from liir_common.rollout import changes
 from liir_common.rollout.playable import check_playable
 from liir_common.rpc.gen.liir.v1 import rollout_pb2, tensor_pb2
 from liir_common.types import EnvSpec, Exploration, Ticket, Trajectory, Weights
@@ -22,6 +24,13 @@ _DTYPES = {
     tensor_pb2.DTYPE_BOOL: np.dtype("?"),
     tensor_pb2.DTYPE_INT16: np.dtype("<i2"),
 }
+_RAW, _ZSTD, _CHANGES = (
+    tensor_pb2.ENCODING_RAW,
+    tensor_pb2.ENCODING_ZSTD,
+    tensor_pb2.ENCODING_CHANGES,
+)
+_REPEATING = ("obs", "state")
+"""Arrays of a trajectory that mostly stay as they are from step to step."""
 _DIMS_SHOWN = 8
 _DTYPE_CODES = {dtype: code for code, dtype in _DTYPES.items()}
 _EXPLORATIONS = {
@@ -32,32 +41,50 @@ _EXPLORATIONS = {
 _EXPLORATION_NAMES = {code: name for name, code in _EXPLORATIONS.items()}
 
 
-def encode_tensor(array: Array, compress: bool = False) -> tensor_pb2.Tensor:
-    """Message with the array's bytes, packed with zstd if asked."""
-    data = array.tobytes()
-    if compress:
-        data = zstandard.ZstdCompressor(level=1).compress(data)
-    code = _DTYPE_CODES[array.dtype]
-    return tensor_pb2.Tensor(dtype=code, shape=array.shape, data=data, zstd=compress)
+def encode_tensor(array: Array, encoding: tensor_pb2.Encoding = _RAW) -> tensor_pb2.Tensor:
+    """Message with the array's bytes, as they are if `encoding` would make more of them."""
+    data = b""
+    if encoding == _ZSTD:
+        data = zstandard.ZstdCompressor(level=1).compress(array.tobytes())
+    elif encoding == _CHANGES:
+        data = changes.pack(array.astype(np.float32, copy=False))
+    if encoding == _RAW or len(data) > array.nbytes:
+        data, encoding = array.tobytes(), _RAW
+    return tensor_pb2.Tensor(dtype=_DTYPE_CODES[array.dtype], shape=array.shape, data=data, encoding=encoding)
 
 
 def decode_tensor(
     message: tensor_pb2.Tensor, name: str, dtype: np.dtype[np.generic], shape: tuple[int, ...]
 ) -> Array:
-    """Read-only array of exactly the wanted dtype and shape, sharing the message's bytes if it can."""
+    """Array of exactly the wanted dtype and shape; read-only where it shares the message's bytes."""
     got = _DTYPES.get(message.dtype)
     if got != dtype or message.shape != list(shape):
         raise ValueError(
             f"{name}: wanted {dtype.name} {list(shape)}, "
             f"got {got.name if got else 'an unknown dtype'} {_dims(message)}"
         )
+    data = message.data
+    if message.encoding == _CHANGES:
+        return _unpack_changes(data, name, dtype, shape)
     size = dtype.itemsize * math.prod(shape)
-    data = _unpack(message.data, name, size) if message.zstd else message.data
+    if message.encoding == _ZSTD:
+        data = _unpack_zstd(data, name, size)
+    elif message.encoding != _RAW:
+        raise ValueError(f"{name}: wanted an encoding this build knows, got {message.encoding}")
     if len(data) != size:
         raise ValueError(f"{name}: wanted {size} bytes for {dtype.name} {list(shape)}, got {len(data)}")
     if dtype == np.bool_ and data.translate(None, b"\0\1"):
         raise ValueError(f"{name}: wanted booleans as bytes 0 or 1, got other bytes")
     return np.frombuffer(data, dtype).reshape(shape)
+
+
+def _unpack_changes(data: bytes, name: str, dtype: np.dtype[np.generic], shape: tuple[int, ...]) -> Array:
+    if dtype != np.float32:
+        raise ValueError(f"{name}: wanted changes of float32 alone, got those of {dtype.name}")
+    try:
+        return changes.unpack(data, shape)
+    except ValueError as error:
+        raise ValueError(f"{name}: wanted {error}") from None
 
 
 def _dims(message: tensor_pb2.Tensor) -> str:
@@ -66,7 +93,7 @@ def _dims(message: tensor_pb2.Tensor) -> str:
     return f"[{shown}, …]" if len(message.shape) > _DIMS_SHOWN else f"[{shown}]"
 
 
-def _unpack(data: bytes, name: str, size: int) -> bytes:
+def _unpack_zstd(data: bytes, name: str, size: int) -> bytes:
     # The frame's own claim is checked first: it is what the library would allocate.
     try:
         claimed = zstandard.frame_content_size(data)
@@ -121,7 +148,10 @@ def decode_ticket(message: rollout_pb2.Ticket) -> Ticket:
 def encode_trajectory(
     trajectory: Trajectory, stats: rollout_pb2.ActorStats, compress: bool = False
 ) -> rollout_pb2.Trajectory:
-    """Message with everything the episode produced."""
+    """Message with everything the episode produced, packed with zstd if asked."""
+    encodings = dict.fromkeys(_REPEATING, _CHANGES)
+    if compress:
+        encodings = dict.fromkeys(types.TRAJECTORY_ARRAYS, _ZSTD)
     return rollout_pb2.Trajectory(
         episode_id=trajectory.episode_id,
         policy_version=trajectory.policy_version,
@@ -129,8 +159,20 @@ def encode_trajectory(
         truncated=trajectory.truncated,
         info=list(trajectory.info.values()),
         stats=stats,
-        **{name: encode_tensor(getattr(trajectory, name), compress) for name in types.TRAJECTORY_ARRAYS},
+        **{
+            name: encode_tensor(getattr(trajectory, name), encodings.get(name, _RAW))
+            for name in types.TRAJECTORY_ARRAYS
+        },
     )
+
+
+@cache
+def _layout(spec: EnvSpec, length: int) -> list[tuple[str, np.dtype[np.generic], tuple[int, ...]]]:
+    """Name, dtype and shape of each array of an episode of `length` steps."""
+    return [
+        (name, np.dtype(dtype), types.expected_shape(name, spec, length))
+        for name, (dtype, _) in types.TRAJECTORY_ARRAYS.items()
+    ]
 
 
 def decode_trajectory(message: rollout_pb2.Trajectory, spec: EnvSpec) -> Trajectory:
@@ -143,10 +185,8 @@ def decode_trajectory(message: rollout_pb2.Trajectory, spec: EnvSpec) -> Traject
     if len(message.info) != len(spec.info_keys):
         raise ValueError(f"info: wanted {len(spec.info_keys)} figures, got {len(message.info)}")
     arrays = {
-        name: decode_tensor(
-            getattr(message, name), name, np.dtype(dtype), types.expected_shape(name, spec, length)
-        )
-        for name, (dtype, _) in types.TRAJECTORY_ARRAYS.items()
+        name: decode_tensor(getattr(message, name), name, dtype, shape)
+        for name, dtype, shape in _layout(spec, length)
     }
     trajectory = Trajectory(
         episode_id=message.episode_id,

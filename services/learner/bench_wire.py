@@ -93,6 +93,8 @@ def bench_wire(map_name: str, streams: int = 4, batches: int = 40, repeats: int 
     settings = config.load(None, [f"env.map={map_name}", "training.lag=1"])
     per_repeat = batches * settings.training.batch_episodes
 
+    set_up_process(1)
+
     async def measure() -> tuple[list[float], list[float]]:
         rates, costs = [], []
         async with _intake(settings, streams, _tickets(settings)) as intake:
@@ -162,7 +164,7 @@ def bench_beside(
 
     def learn(stop: threading.Event, steps: list[float]) -> None:
         set_up_process(1)  # threads are counted for each thread that asks
-        while not stop.is_set():
+        while not stop.is_set() or len(steps) < 2:  # the first is the warm-up
             begin = time.perf_counter()
             learner.update(batch)
             steps.append(time.perf_counter() - begin)

@@ -16,7 +16,9 @@ import atheris
 import psutil
 
 # numba compiles nothing that is instrumented.
-with atheris.instrument_imports(include=["liir_common"], exclude=["liir_common.rollout.playable"]):
+with atheris.instrument_imports(
+    include=["liir_common"], exclude=["liir_common.rollout.changes", "liir_common.rollout.playable"]
+):
     from liir_common.rpc import codec
 
 from google.protobuf.message import DecodeError

@@ -33,7 +33,7 @@ from liir_common.rollout.policy import random_weights
 from liir_common.rpc import codec
 from liir_common.rpc.channel import CHANNEL_OPTIONS
 from liir_common.rpc.gen.liir.v1 import checkpoint_pb2, rollout_pb2, tensor_pb2, training_pb2
-from liir_common.types import EnvSpec, Exploration, Ticket, policy_shapes
+from liir_common.types import TRAJECTORY_ARRAYS, EnvSpec, Exploration, Ticket, policy_shapes
 from tests.e2e import service
 from tests.samples import SPEC, make_trajectory
 
@@ -62,7 +62,8 @@ def bombs() -> list[bytes]:
     size = BOMB_BYTES.to_bytes(4, "little")
     assert honest.count(size, 0, 16) == 1, "the frame's header has its size elsewhere"
     # The sizes that the tensors of the sample have, so that the claim passes for the truth.
-    wanted = {len(tensor.data) for _, tensor in tensors(trajectory(SPEC, compress=False))}
+    sample = make_trajectory(spec=SPEC)
+    wanted = {getattr(sample, name).nbytes for name in TRAJECTORY_ARRAYS}
     return [honest, silent, *(honest.replace(size, w.to_bytes(4, "little"), 1) for w in wanted)]
 
 
@@ -115,9 +116,9 @@ def damage_tensor(rng: random.Random, message: rollout_pb2.Trajectory) -> None:
         case 2:
             tensor.shape.extend([rng.choice(DIMENSIONS)] * rng.choice((1, 3, 1000)))
         case 3:
-            tensor.zstd = not tensor.zstd
+            tensor.encoding = rng.randrange(5)
         case 4:
-            tensor.zstd, tensor.data = True, rng.choice(BOMBS)
+            tensor.encoding, tensor.data = tensor_pb2.ENCODING_ZSTD, rng.choice(BOMBS)
         case 5:
             tensor.data = damage_bytes(rng, tensor.data)
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from liir_common.rpc import codec
-from liir_common.rpc.gen.liir.v1 import rollout_pb2
+from liir_common.rpc.gen.liir.v1 import rollout_pb2, tensor_pb2
 from tests.samples import SPEC
 from tests.security import fuzz_wire
 
@@ -43,8 +43,8 @@ def test_a_learner_takes_damaged_calls() -> None:
 @pytest.mark.parametrize("name", ["obs", "mask", "actions", "reward"])
 def test_bombs_are_refused(bomb: bytes, name: str) -> None:
     assert len(bomb) < 2**15
-    message: rollout_pb2.Trajectory = fuzz_wire.trajectory(SPEC, compress=True)
+    message: rollout_pb2.Trajectory = fuzz_wire.trajectory(SPEC, compress=False)
     tensor = getattr(message, name)
-    tensor.data = bomb
+    tensor.encoding, tensor.data = tensor_pb2.ENCODING_ZSTD, bomb
     with pytest.raises(ValueError, match=f"{name}: wanted a zstd frame of"):
         codec.decode_trajectory(message, SPEC)

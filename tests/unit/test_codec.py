@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import zstandard
 
+from liir_common.rollout import changes
 from liir_common.rpc import codec
 from liir_common.rpc.gen.liir.v1 import rollout_pb2, tensor_pb2
 from liir_common.types import Exploration, Ticket, policy_shapes, trajectories_equal
@@ -27,6 +28,29 @@ def test_trajectory_round_trip(compress: bool, length: int) -> None:
     assert trajectories_equal(
         codec.decode_trajectory(rollout_pb2.Trajectory.FromString(wire), SPEC), trajectory
     )
+
+
+def test_what_repeats_is_not_sent() -> None:
+    message = encode()
+    assert message.obs.encoding == message.state.encoding == tensor_pb2.ENCODING_CHANGES
+    rows, width, changed = 7, 2 * 5, 4
+    assert len(message.obs.data) == 4 * (rows + changed * width)
+
+
+@pytest.mark.parametrize("width", [1, 31, 32, 33, 130])
+def test_changes_keep_every_bit(width: int) -> None:
+    bits = np.random.default_rng(width).choice(
+        np.array([0, 1 << 31, 1, 0x7FC00001, 0x3F800000], np.uint32), (9, width)
+    )
+    array = bits.view(np.float32)  # zeros of both signs and a NaN among them
+    assert np.array_equal(changes.unpack(changes.pack(array), array.shape).view(np.uint32), bits)
+
+
+def test_changes_that_would_be_larger_are_sent_as_they_are() -> None:
+    array = np.arange(1, 61, dtype=np.float32).reshape(6, 10)
+    message = codec.encode_tensor(array, tensor_pb2.ENCODING_CHANGES)
+    assert message.encoding == tensor_pb2.ENCODING_RAW
+    assert message.data == array.tobytes()
 
 
 def test_policy_round_trip() -> None:
@@ -117,7 +141,33 @@ def no_dtype(message: rollout_pb2.Trajectory) -> None:
 
 
 def short(message: rollout_pb2.Trajectory) -> None:
-    message.state.data = message.state.data[:-1]
+    message.reward.data = message.reward.data[:-1]
+
+
+def change_missing(message: rollout_pb2.Trajectory) -> None:
+    message.obs.data = message.obs.data[:-4]
+
+
+def change_too_many(message: rollout_pb2.Trajectory) -> None:
+    message.obs.data += bytes(4)
+
+
+def no_word(message: rollout_pb2.Trajectory) -> None:
+    message.obs.data += bytes(1)
+
+
+def marks_missing(message: rollout_pb2.Trajectory) -> None:
+    message.obs.data = message.obs.data[:24]
+
+
+def mark_beyond_the_row(message: rollout_pb2.Trajectory) -> None:
+    marks = bytearray(message.obs.data)
+    marks[1] |= 1 << 2  # of ten values, the eleventh
+    message.obs.data = bytes(marks) + bytes(4)
+
+
+def changes_of_integers(message: rollout_pb2.Trajectory) -> None:
+    message.actions.encoding = tensor_pb2.ENCODING_CHANGES
 
 
 def not_boolean(message: rollout_pb2.Trajectory) -> None:
@@ -128,17 +178,21 @@ def missing(message: rollout_pb2.Trajectory) -> None:
     message.ClearField("log_mu")
 
 
+def unknown_encoding(message: rollout_pb2.Trajectory) -> None:
+    message.obs.encoding = 7  # type: ignore[assignment]
+
+
 def not_zstd(message: rollout_pb2.Trajectory) -> None:
-    message.obs.zstd = True
+    message.obs.encoding = tensor_pb2.ENCODING_ZSTD
 
 
 def bomb(message: rollout_pb2.Trajectory) -> None:
-    message.obs.zstd = True
+    message.obs.encoding = tensor_pb2.ENCODING_ZSTD
     message.obs.data = zstandard.ZstdCompressor().compress(bytes(2**28))
 
 
 def bomb_without_size(message: rollout_pb2.Trajectory) -> None:
-    message.obs.zstd = True
+    message.obs.encoding = tensor_pb2.ENCODING_ZSTD
     packer = zstandard.ZstdCompressor(write_content_size=False)
     message.obs.data = packer.compress(bytes(2**28))
 
@@ -148,7 +202,14 @@ def bomb_without_size(message: rollout_pb2.Trajectory) -> None:
     [
         (wrong_dtype, "reward: wanted float32"),
         (no_dtype, "got an unknown dtype"),
-        (short, "state: wanted 84 bytes"),
+        (short, "reward: wanted 24 bytes"),
+        (change_missing, r"obs: wanted marks for \[7, 2, 5\] and a value for each"),
+        (change_too_many, "obs: wanted marks"),
+        (no_word, "obs: wanted marks"),
+        (marks_missing, "obs: wanted marks"),
+        (mark_beyond_the_row, "obs: wanted marks"),
+        (changes_of_integers, "actions: wanted changes of float32 alone, got those of int16"),
+        (unknown_encoding, "obs: wanted an encoding this build knows, got 7"),
         (not_boolean, "mask: wanted booleans"),
         (missing, "log_mu: wanted float32"),
         (not_zstd, "obs: wanted a zstd frame"),

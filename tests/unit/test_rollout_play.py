@@ -90,12 +90,12 @@ def test_actors_import_no_torch_ray_or_grpc() -> None:
 def test_warm_up_leaves_nothing_to_compile() -> None:
     warm_up(EnvConfig(map="3m"))
     code = (
-        "from liir_common.config import EnvConfig; from liir_common.rollout import fused, play;"
-        "play.warm_up(EnvConfig(map='3m')); stats = fused._play_episode.stats;"
-        "print(stats.cache_hits.total(), stats.cache_misses.total())"
+        "from liir_common.config import EnvConfig; from liir_common.rollout import changes, fused, play;"
+        "play.warm_up(EnvConfig(map='3m')); stats = [fused._play_episode.stats, changes._pack.stats];"
+        "print(*(f(s).total() for s in stats for f in (lambda s: s.cache_hits, lambda s: s.cache_misses)))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["1", "0"]
+    assert done.stdout.split() == ["1", "0", "1", "0"]
 
 
 def test_bench_measures_what_it_says() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import gc
 import sys
 
 import torch
@@ -18,6 +19,7 @@ def set_up_process(threads: int) -> None:
     more page faults than arithmetic. Threads but the first would have arenas of their own that do so
     whatever the thresholds, so all share one; call this before the thread that trains is started, too.
     """
+    gc.freeze()  # What is there by now mostly stays; no collection has to look through it again.
     torch.set_num_threads(threads)
     if sys.platform == "linux":
         libc = ctypes.CDLL(None)

@@ -24,17 +24,19 @@ _sym_db = _symbol_database.Default()
 
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x14liir/v1/tensor.proto\x12\x07liir.v1\"R\n\x06Tensor\x12\x1d\n\x05\x64type\x18\x01 \x01(\x0e\x32\x0e.liir.v1.DType\x12\r\n\x05shape\x18\x02 \x03(\r\x12\x0c\n\x04\x64\x61ta\x18\x03 \x01(\x0c\x12\x0c\n\x04zstd\x18\x04 \x01(\x08\"<\n\x0bNamedTensor\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x1f\n\x06tensor\x18\x02 \x01(\x0b\x32\x0f.liir.v1.Tensor*R\n\x05\x44Type\x12\x15\n\x11\x44TYPE_UNSPECIFIED\x10\x00\x12\x11\n\rDTYPE_FLOAT32\x10\x01\x12\x0e\n\nDTYPE_BOOL\x10\x02\x12\x0f\n\x0b\x44TYPE_INT16\x10\x03\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x14liir/v1/tensor.proto\x12\x07liir.v1\"i\n\x06Tensor\x12\x1d\n\x05\x64type\x18\x01 \x01(\x0e\x32\x0e.liir.v1.DType\x12\r\n\x05shape\x18\x02 \x03(\r\x12\x0c\n\x04\x64\x61ta\x18\x03 \x01(\x0c\x12#\n\x08\x65ncoding\x18\x04 \x01(\x0e\x32\x11.liir.v1.Encoding\"<\n\x0bNamedTensor\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x1f\n\x06tensor\x18\x02 \x01(\x0b\x32\x0f.liir.v1.Tensor*R\n\x05\x44Type\x12\x15\n\x11\x44TYPE_UNSPECIFIED\x10\x00\x12\x11\n\rDTYPE_FLOAT32\x10\x01\x12\x0e\n\nDTYPE_BOOL\x10\x02\x12\x0f\n\x0b\x44TYPE_INT16\x10\x03*E\n\x08\x45ncoding\x12\x10\n\x0c\x45NCODING_RAW\x10\x00\x12\x11\n\rENCODING_ZSTD\x10\x01\x12\x14\n\x10\x45NCODING_CHANGES\x10\x02\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'liir.v1.tensor_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_DTYPE']._serialized_start=179
-  _globals['_DTYPE']._serialized_end=261
+  _globals['_DTYPE']._serialized_start=202
+  _globals['_DTYPE']._serialized_end=284
+  _globals['_ENCODING']._serialized_start=286
+  _globals['_ENCODING']._serialized_end=355
   _globals['_TENSOR']._serialized_start=33
-  _globals['_TENSOR']._serialized_end=115
-  _globals['_NAMEDTENSOR']._serialized_start=117
-  _globals['_NAMEDTENSOR']._serialized_end=177
+  _globals['_TENSOR']._serialized_end=138
+  _globals['_NAMEDTENSOR']._serialized_start=140
+  _globals['_NAMEDTENSOR']._serialized_end=200
 # @@protoc_insertion_point(module_scope)

@@ -63,8 +63,10 @@ def reset(tables, battle, seed):
     if rules.hunts:
         for i in range(n_allies, len(battle.units)):
             battle.units[i].order, battle.units[i].target = ATTACK, _prey(rules, battle, i)
+    # A constant would have all of it compiled once more.
+    upwards = np.bool_(True)
     for _ in range(rules.head_start):
-        _play_loop(tables, battle, True)
+        _play_loop(tables, battle, upwards)
 
 
 @inlined
@@ -538,7 +540,8 @@ def _may_treat(tables, battle, i, j):
 @inlined
 def _fly_missiles(tables, battle, now):
     """Missiles home in on their targets; they outlive the unit that launched them."""
-    for i in range(len(battle.units)):
+    for k in range(len(battle.units)):
+        i = np.uint64(k)
         unit = battle.units[i]
         if unit.missile_target >= 0:
             j = unit.missile_target

@@ -83,30 +83,30 @@ def play_episodes(tables, battle, buffers, memory, policy, first_seed, outcomes)
     """`play` with everything allocated, one episode per row of outcomes."""
     for episode in range(len(outcomes)):
         seed = rng.derive(first_seed, episode)
-        outcomes[episode, 1] = _play_episode(tables, battle, buffers, memory, policy, seed)
+        memory.stream[0] = rng.derive(seed, seeds.POLICY)
+        memory.targets[:] = -1
+        reset(tables, battle, seed)
+        observe(tables, battle, buffers.obs, buffers.state, buffers.mask, buffers.alive)
+        total = 0.0
+        while not (battle.status[TERMINATED] or battle.status[TRUNCATED]):
+            _act(tables, battle, buffers.mask, memory, policy)
+            total += step(tables, battle, memory.actions)
+            observe(tables, battle, buffers.obs, buffers.state, buffers.mask, buffers.alive)
         outcomes[episode, 0] = battle.status[STEPS]
+        outcomes[episode, 1] = total
         outcomes[episode, 2] = battle.status[WON]
         outcomes[episode, 3] = battle.status[DEAD_ALLIES]
         outcomes[episode, 4] = battle.status[DEAD_ENEMIES]
 
 
 @inlined
-def _play_episode(tables, battle, buffers, memory, policy, seed):
-    memory.stream[0] = rng.derive(seed, seeds.POLICY)
-    memory.targets[:] = -1
-    reset(tables, battle, seed)
-    observe(tables, battle, buffers.obs, buffers.state, buffers.mask, buffers.alive)
-    total = 0.0
-    while not (battle.status[TERMINATED] or battle.status[TRUNCATED]):
-        if policy == RANDOM:
-            _act_randomly(buffers.mask, memory.stream, memory.actions)
-        elif policy == CLOSEST_ENEMY:
-            _attack_closest(tables, battle, memory.targets, memory.actions)
-        else:
-            _act_always(NORTH if policy == STEP_ASIDE else STOP, buffers.mask, memory.actions)
-        total += step(tables, battle, memory.actions)
-        observe(tables, battle, buffers.obs, buffers.state, buffers.mask, buffers.alive)
-    return total
+def _act(tables, battle, mask, memory, policy):
+    if policy == RANDOM:
+        _act_randomly(mask, memory.stream, memory.actions)
+    elif policy == CLOSEST_ENEMY:
+        _attack_closest(tables, battle, memory.targets, memory.actions)
+    else:
+        _act_always(NORTH if policy == STEP_ASIDE else STOP, mask, memory.actions)
 
 
 @inlined

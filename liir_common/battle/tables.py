@@ -35,12 +35,14 @@ _Disc = tuple[_Place, float]
 """A place and the radius of what stands there"""
 
 # Without numba's reference counting a kernel is five times as fast, and cannot allocate.
-_OPTIONS: Any = {"error_model": "numpy", "_nrt": False}
+_OPTIONS: Any = {"error_model": "numpy", "_nrt": False, "no_cfunc_wrapper": True}
+# What takes all those arrays apart for calls from Python was half of the time to compile.
+_PART_OPTIONS: Any = _OPTIONS | {"no_cpython_wrapper": True}
 kernel = njit(cache=True, nogil=True, **_OPTIONS)
 """Decorator of the functions that are called from outside."""
-inlined = njit(forceinline=True, **_OPTIONS)
+inlined = njit(forceinline=True, **_PART_OPTIONS)
 """Decorator of their parts, which become one piece of code with them."""
-apart = njit(**_OPTIONS)
+apart = njit(**_PART_OPTIONS)
 """Decorator of parts that few maps need, which stay pieces of code of their own."""
 
 FIRST_ATTACK = 6

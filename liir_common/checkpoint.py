@@ -115,8 +115,7 @@ class CheckpointStore:
         self._deleted = {int(match[1]): match[2] for match in deleted if int(match[1]) not in kept}
         for episode in _episodes(names, r"deleted-(\d+)\.json") - kept:  # as older builds named them
             self._deleted[episode] = self._read_manifest(f"{self._root}/deleted-{episode:09d}.json").sha256
-        for episode in _episodes(names, r"checkpoint-(\d+)\.safetensors") & self._deleted.keys():
-            self._fs.rm(self._weights_path(episode))  # who wanted to died before
+        self._left_over = _episodes(names, r"checkpoint-(\d+)\.safetensors") & self._deleted.keys()
 
     @property
     def manifests(self) -> list[Manifest]:
@@ -164,6 +163,13 @@ class CheckpointStore:
             self._deleted[episode] = manifest.sha256
             self._manifests = [other for other in self._manifests if other.episode != episode]
         self._fs.rm(self._weights_path(episode))
+
+    def remove_leftovers(self) -> None:
+        """Remove the weights of deleted checkpoints that were there when the store was opened: who wanted to
+        died before. For the store's owner; a mere reader might not be allowed to."""
+        for episode in self._left_over:
+            self._fs.rm(self._weights_path(episode))
+        self._left_over = set()
 
     def find(self, episode: int) -> Manifest:
         """The manifest of the checkpoint frozen after `episode` episodes.

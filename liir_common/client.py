@@ -19,7 +19,14 @@ from numpy.typing import NDArray
 
 from liir_common.checkpoint import Manifest, unpack
 from liir_common.config import PLAINTEXT, Config, SecurityConfig, from_tree, merge, parse_settings
-from liir_common.errors import CorruptError, LiirError, MissingError, RefusedError, UnreachableError
+from liir_common.errors import (
+    CorruptError,
+    DamagedError,
+    LiirError,
+    MissingError,
+    RefusedError,
+    UnreachableError,
+)
 from liir_common.files import appended_alone, write_atomic
 from liir_common.rpc.channel import DEADLINE_S, backoffs, connect
 from liir_common.rpc.gen.liir.v1 import (
@@ -32,7 +39,7 @@ from liir_common.rpc.tokens import Role
 
 AWAY = (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.DEADLINE_EXCEEDED)
 """Codes that tell of the connection, not of the call: to try again may help."""
-_ERRORS = {grpc.StatusCode.NOT_FOUND: MissingError, grpc.StatusCode.DATA_LOSS: CorruptError}
+_ERRORS = {grpc.StatusCode.NOT_FOUND: MissingError, grpc.StatusCode.DATA_LOSS: DamagedError}
 _PAGE = 1000
 _DOWNLOAD_TRIES = 5
 """In a row that brought nothing; then a download is given up."""
@@ -99,7 +106,7 @@ class CheckpointClient:
 
         Raises:
             MissingError: there is no such checkpoint, or it was deleted.
-            LiirError: the learner's copy is damaged.
+            DamagedError: the learner's copy is damaged.
             UnreachableError: the connection kept breaking.
             CorruptError: the bytes that came do not have the manifest's digest.
         """
@@ -270,10 +277,14 @@ class TrainingClient:
         answer = stub.Check(health_pb2.HealthCheckRequest(), timeout=DEADLINE_S)  # type: ignore[attr-defined]
         return bool(answer.status == health_pb2.HealthCheckResponse.SERVING)
 
+    def run(self) -> training_pb2.GetRunResponse:
+        """What never changes during the run."""
+        run: training_pb2.GetRunResponse = self._stub.GetRun(training_pb2.GetRunRequest(), timeout=DEADLINE_S)
+        return run
+
     def config(self) -> Config:
         """The run's resolved configuration; `security` is each process's own and not part of it."""
-        run = self._stub.GetRun(training_pb2.GetRunRequest(), timeout=DEADLINE_S)
-        return from_tree(json.loads(run.config_json))
+        return from_tree(json.loads(self.run().config_json))
 
     def status(self) -> training_pb2.GetStatusResponse:
         """How far the run is."""

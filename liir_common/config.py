@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 import os
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -464,10 +465,17 @@ def _check_environment() -> None:
     """Refuse misspelt variables, of which pydantic takes no notice."""
     known = {f"LIIR_{name}".upper() for name in Config.model_fields} | {"LIIR_TOKENS"}
     for name in os.environ:
+        if re.match(r"LIIR_(\w+_)?(SERVICE|PORT)(_|$)", name):
+            continue  # Kubernetes tells every container so of a service that is called liir
         if name.upper().startswith("LIIR_") and name.upper().split("__")[0] not in known:
             close = difflib.get_close_matches(name.upper().split("__")[0], known, n=1)
             hint = f"did you mean {close[0]}?" if close else f"known: {', '.join(sorted(known))}"
             raise ConfigError(f"the environment has the unknown variable {name}; {hint}")
+
+
+def holds_run(run_dir: Path) -> bool:
+    """Whether a run was begun there; its configuration is the last that it writes before it trains."""
+    return (run_dir / "config.yaml").exists()
 
 
 def from_tree(tree: Mapping[str, Any]) -> Config:

@@ -35,6 +35,10 @@ class CorruptError(LiirError, ValueError):
     exit_code = 4
 
 
+class DamagedError(CorruptError):
+    """The learner's own copy of a checkpoint is damaged."""
+
+
 class RefusedError(LiirError):
     """The learner will never serve this process; to start it again would not help."""
 
@@ -68,6 +72,8 @@ def exit_on_error() -> Iterator[None]:
 def meaning(exit_code: int) -> str:
     """What an exit code says, in one sentence."""
     texts = {kind.exit_code: kind.__doc__ for kind in LiirError.__subclasses__() if "exit_code" in vars(kind)}
+    if exit_code == 0:
+        return "asked to end"
     return (texts.get(exit_code) or "an error that is not foreseen").rstrip(".")
 
 

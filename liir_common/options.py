@@ -83,13 +83,8 @@ def _check_same_run(kept: Config, resumed: Config, run_dir: Path) -> None:
         )
 
 
-def holds_run(run_dir: Path) -> bool:
-    """Whether a run was begun there; its configuration is the last that it writes before it trains."""
-    return (run_dir / "config.yaml").exists()
-
-
 def _check_run_dir(run_dir: Path, resume: bool) -> None:
-    exists = holds_run(run_dir)
+    exists = config.holds_run(run_dir)
     if exists and not resume:
         raise ConfigError(f"{run_dir} holds a run already; go on with --resume, or name another --run-dir")
     if resume and not exists:

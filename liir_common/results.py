@@ -12,6 +12,7 @@ from typing import Any
 
 import yaml
 
+from liir_common.config import holds_run
 from liir_common.errors import ConfigError
 from liir_common.files import read_table
 from liir_common.report import method_label
@@ -51,7 +52,7 @@ def rows(run_dir: Path, method: str = "") -> list[dict[str, Any]]:
     Raises:
         ConfigError: there is no run.
     """
-    if not (run_dir / "run.json").exists():
+    if not holds_run(run_dir):
         raise ConfigError(f"{run_dir} holds no run")
     tree = yaml.safe_load((run_dir / "config.yaml").read_text(encoding="utf-8"))
     about = {

@@ -25,7 +25,7 @@ import yaml
 from pydantic import Field, ValidationError
 
 from liir_common import results
-from liir_common.config import Config, Section, differences, from_tree, merge, parse_settings
+from liir_common.config import Config, Section, differences, from_tree, holds_run, merge, parse_settings
 from liir_common.errors import ConfigError
 from liir_common.files import csv_text, read_table, write_atomic
 from liir_common.launch import die_with_parent
@@ -74,14 +74,15 @@ class Outcome:
 
     name: str
     status: str
-    """complete, failed, stopped, or skipped because it was complete already"""
+    """complete; skipped because it was complete already; untested, trained to the end but with a checkpoint
+    without its test, which a damaged one is until its file is restored; failed; stopped"""
     exit_code: int
     log: Path
 
     @property
     def failed(self) -> bool:
         """Whether the run is not complete."""
-        return self.status in ("failed", "stopped")
+        return self.status in ("untested", "failed", "stopped")
 
 
 def plan(
@@ -186,7 +187,7 @@ class Sweep:
         if is_complete(self._output / run.name, run.config):
             self._end(run, "skipped", 0)
             return
-        resumed = (self._output / run.name / "run.json").exists()
+        resumed = holds_run(self._output / run.name)
         _say(f"{run.name} {'goes on' if resumed else 'begins'}")
         with self._log(run).open("ab") as file:
             process = subprocess.Popen(
@@ -226,19 +227,22 @@ class Sweep:
             code = process.poll()
             if code is not None:
                 del self._running[name]
-                complete = code == 0 and is_complete(self._output / name, run.config)
-                stopped = "stopped" if self._stop_signal else "failed"
-                self._end(run, "complete" if complete else stopped, code)
+                self._end(run, self._status(run, code), code)
                 self._write()
+
+    def _status(self, run: Run, code: int) -> str:
+        if code == 0:
+            return "complete" if is_complete(self._output / run.name, run.config) else "untested"
+        return "stopped" if self._stop_signal else "failed"
 
     def _end(self, run: Run, status: str, code: int) -> None:
         outcome = Outcome(run.name, status, code, self._log(run))
         self._outcomes.append(outcome)
-        _say(f"{run.name} {status}" + (f" with code {code}; see {outcome.log}" if status == "failed" else ""))
+        _say(f"{run.name} {status}" + (f" (exit code {code}); see {outcome.log}" if outcome.failed else ""))
 
     def _write(self) -> None:
         """Gather every run of the plan that has begun, whenever it ran, beside the sweep's other parts."""
-        begun = [run for run in self._runs if (self._output / run.name / "run.json").exists()]
+        begun = [run for run in self._runs if holds_run(self._output / run.name)]
         rows = [row for run in begun for row in results.rows(self._output / run.name, run.method)]
         self._replace_rows("results.csv", rows, results.COLUMNS)
         self._replace_rows("runs.csv", [self._row(run) for run in self._runs])
@@ -252,7 +256,7 @@ class Sweep:
         ended = {outcome.name: outcome.status for outcome in self._outcomes}.get(run.name)
         run_dir = self._output / run.name
         complete = is_complete(run_dir, run.config)
-        begun = "begun" if (run_dir / "run.json").exists() else "waiting"
+        begun = "begun" if holds_run(run_dir) else "waiting"
         steps = read_table(run_dir / "metrics.csv")
         return {
             "run": run.name,

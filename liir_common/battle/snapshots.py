@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, TypedDict
+from typing import Any, NotRequired, TypedDict
 
 from liir_common.battle.tables import ORDERS, Battle, Tables
 from liir_common.battle.terrain import MAP_SIZE
@@ -36,9 +36,9 @@ class UnitRecord(TypedDict):
     """One of `tables.ORDERS`"""
     target: int | None
     """Number of the unit attacked, within the other team; of the unit healed, within its own"""
-    goal_x: float
-    goal_y: float
-    """Where a move or an attack-move leads"""
+    goal_x: NotRequired[float]
+    goal_y: NotRequired[float]
+    """Where a move or an attack-move leads; a record put back without it has the unit stay"""
 
 
 def take(tables: Tables, battle: Battle, unit_types: Sequence[str]) -> list[UnitRecord]:
@@ -108,7 +108,7 @@ def _check(tables: Tables, i: int, record: UnitRecord) -> None:
         "goal_x": goals,
         "goal_y": goals,
     }
-    values: dict[str, Any] = {**record}
+    values: dict[str, Any] = {"goal_x": record["x"], "goal_y": record["y"], **record}
     for name, (low, high) in bounds.items():
         # So that NaN is refused too.
         if not low <= values[name] <= high:
@@ -145,7 +145,7 @@ def _put(tables: Tables, battle: Battle, i: int, record: UnitRecord) -> None:
     battle.x[i], battle.y[i] = record["x"], record["y"]
     unit["health"], unit["shield"], unit["energy"] = record["health"], record["shield"], record["energy"]
     unit["alive"], unit["order"] = record["alive"], ORDERS.index(record["order"])
-    unit["goal_x"], unit["goal_y"] = record["goal_x"], record["goal_y"]
+    unit["goal_x"], unit["goal_y"] = record.get("goal_x", record["x"]), record.get("goal_y", record["y"])
     unit["ready_at"], unit["free_at"], unit["hits"] = now + record["cooldown"], now, 0
     unit["hurt_at"] = now
     unit["target"] = -1 if target is None else _side(tables, i)[target]

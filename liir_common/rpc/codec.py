@@ -6,6 +6,7 @@ Every function that decodes raises `ValueError` with what was wanted and what ca
 import math
 from collections.abc import Mapping
 from functools import cache
+from typing import cast
 
 import numpy as np
 import zstandard
@@ -47,7 +48,8 @@ def encode_tensor(array: Array, encoding: tensor_pb2.Encoding = _RAW) -> tensor_
     if encoding == _ZSTD:
         data = zstandard.ZstdCompressor(level=1).compress(array.tobytes())
     elif encoding == _CHANGES:
-        data = changes.pack(array.astype(np.float32, copy=False))
+        assert array.dtype == np.float32
+        data = changes.pack(cast(NDArray[np.float32], array))
     if encoding == _RAW or len(data) > array.nbytes:
         data, encoding = array.tobytes(), _RAW
     return tensor_pb2.Tensor(dtype=_DTYPE_CODES[array.dtype], shape=array.shape, data=data, encoding=encoding)

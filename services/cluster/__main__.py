@@ -12,7 +12,7 @@ import yaml
 
 from liir_common import launch, logs, options
 from liir_common.certs import make_certs
-from liir_common.config import PLAINTEXT, ActorsConfig, SecurityConfig
+from liir_common.config import PLAINTEXT, ActorsConfig, SecurityConfig, holds_run
 from liir_common.errors import LiirError, exit_on_error
 from liir_common.rpc import carry
 from liir_common.rpc.tokens import Role
@@ -32,7 +32,7 @@ def train(
 ) -> None:
     """Train on the Ray cluster that this machine is the head of."""
     logs.configure("train")
-    resume = resume or (resume_if_begun and run_dir is not None and options.holds_run(run_dir))
+    resume = resume or (resume_if_begun and run_dir is not None and holds_run(run_dir))
     with exit_on_error():
         start_ray(ActorsConfig(ray_address="auto"))
         command = "ray submit deploy/cluster.yaml deploy/train.py --"

@@ -9,9 +9,10 @@ import numpy as np
 import structlog
 
 from liir_common import checkpoint, metrics, seeds
-from liir_common.client import AWAY, CheckpointClient
+from liir_common.build import build
+from liir_common.client import AWAY, CheckpointClient, TrainingClient
 from liir_common.config import Config
-from liir_common.errors import CorruptError, MissingError, RefusedError, UnreachableError
+from liir_common.errors import DamagedError, MissingError, RefusedError, UnreachableError
 from liir_common.rollout.player import Player
 from liir_common.rpc.channel import backoffs
 from liir_common.rpc.gen.liir.v1 import checkpoint_pb2
@@ -59,13 +60,18 @@ class Evaluator:
         """Return when the run is complete and every checkpoint has its test.
 
         Raises:
-            RefusedError: the learner refused a call; to try again would not help.
+            CorruptError: what came has not the manifest's digest, or is of another build's format.
+            RefusedError: the learner refused a call, or plays another game; to try again would not help.
         """
-        waits = backoffs()
-        # The client connects again by itself.
-        with CheckpointClient(self._address, security=self._config.security, role=Role.EVALUATOR) as client:
+        waits, security = backoffs(), self._config.security
+        # The clients connect again by themselves.
+        with (
+            TrainingClient(self._address, security=security, role=Role.EVALUATOR) as training,
+            CheckpointClient(self._address, security=security, role=Role.EVALUATOR) as client,
+        ):
             while True:
                 try:
+                    self._check_game(training)
                     self._catch_up(client)
                     return
                 except grpc.RpcError as error:
@@ -75,6 +81,16 @@ class Evaluator:
                 except UnreachableError as error:
                     log.warning("the learner is away", address=self._address, reason=str(error))
                 time.sleep(next(waits))
+
+    def _check_game(self, training: TrainingClient) -> None:
+        run = training.run()
+        wanted = {"environment": run.env_spec_hash, "build": run.build}
+        got = {"environment": self._player.spec.hash, "build": build()}
+        if wanted != got:
+            raise RefusedError(
+                f"this evaluator would play other episodes: wanted {wanted}, got {got}; "
+                "start it from the learner's build"
+            )
 
     def _catch_up(self, client: CheckpointClient) -> None:
         tested = {evaluation.episode for evaluation in client.evaluations()}
@@ -87,7 +103,7 @@ class Evaluator:
             except MissingError as error:
                 # Only tested ones are ever deleted: another evaluator was quicker.
                 log.info("not tested", episode=frozen.episode, reason=str(error))
-            except CorruptError as error:
+            except DamagedError as error:
                 log.error("not tested", episode=frozen.episode, reason=str(error))
             else:
                 metrics.EVALUATED_EPISODE.set(frozen.episode)

@@ -5,6 +5,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from liir_common import logs, options
+from liir_common.config import holds_run
 from liir_common.errors import exit_on_error, storage_explained
 from liir_common.files import held
 from liir_common.rollout.play import env_spec
@@ -22,7 +23,7 @@ def learner(
     """Train a run: serve tickets to actors, checkpoints to evaluators."""
     logs.configure("learner")
     path = run_dir or Path("runs/learner")
-    resume = resume or (resume_if_begun and options.holds_run(path))
+    resume = resume or (resume_if_begun and holds_run(path))
     with exit_on_error():
         resolved = options.load_run_config(config, settings, path, resume)
         spec = env_spec(resolved.env)

@@ -80,10 +80,13 @@ class CheckpointService(checkpoint_pb2_grpc.CheckpointServiceServicer):
         manifest = self._find(request.episode)
         try:
             data = self._run.checkpoints.read(manifest)
-        except (CorruptError, OSError) as error:
+        except (CorruptError, FileNotFoundError) as error:
             await self._note_damage(request.episode)
             message = f"{error}; restore its file from a backup"
             raise Refused(grpc.StatusCode.DATA_LOSS, message) from None
+        except OSError as error:  # which may pass
+            message = f"checkpoint {request.episode} cannot be read now: {error}"
+            raise Refused(grpc.StatusCode.UNAVAILABLE, message) from None
         if request.offset > len(data):
             raise ValueError(f"offset: wanted 0..{len(data)}, got {request.offset}")
         header = checkpoint_pb2.CheckpointHeader(
@@ -130,6 +133,8 @@ class CheckpointService(checkpoint_pb2_grpc.CheckpointServiceServicer):
             # The evaluator keeps trying, and until then the learner does not call the checkpoint tested.
             raise Refused(grpc.StatusCode.UNAVAILABLE, str(error)) from None
         self.evaluations[evaluation.episode] = evaluation
+        self._damaged.discard(evaluation.episode)  # its file has been restored
+        metrics.CHECKPOINTS_DAMAGED.set(len(self._damaged))
         self._show_evaluations()
         await self.changed()
         return checkpoint_pb2.ReportEvaluationResponse(duplicate=False)

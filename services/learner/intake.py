@@ -91,6 +91,9 @@ class Intake:
         """
         while self._asking and (ticket := self._next_ticket()):
             actor = self._asking[0]
+            if ticket.episode_id in self._held[actor]:  # it is late with that one, and has it still
+                self._held[actor][ticket.episode_id] = now
+                continue
             self._credits[actor] -= 1
             if not self._credits[actor]:
                 self._asking.popleft()

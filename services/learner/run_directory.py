@@ -78,6 +78,7 @@ class RunDirectory:
         )
         write_atomic(path / "config.yaml", yaml.safe_dump(config.tree(), sort_keys=False).encode())
         self.checkpoints = CheckpointStore(str(path / "checkpoints"))
+        self.checkpoints.remove_leftovers()
         self.replay = ReplayStore(path / "state")
         self.metrics = Table(path / "metrics.csv")
         self.evaluations = Table(path / "evaluations.csv")
@@ -122,7 +123,7 @@ class RunDirectory:
                     tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
                 counters = Counters(**json.loads(metadata["counters"]))
                 return counters, tensors, json.loads(metadata["notes"])
-            except (SafetensorError, KeyError, TypeError, ValueError) as error:
+            except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
                 log.error(
                     "a saved state cannot be read; trying the one before", path=str(path), error=str(error)
                 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import os
 import re
 import socket
@@ -22,7 +23,7 @@ from liir_common import checkpoint, config
 from liir_common.checkpoint import Manifest
 from liir_common.client import CheckpointClient
 from liir_common.config import PLAINTEXT
-from liir_common.errors import CorruptError, LiirError, UnreachableError
+from liir_common.errors import CorruptError, DamagedError, UnreachableError
 from liir_common.policy import Policy
 from liir_common.rollout.play import env_spec
 from liir_common.rollout.policy import random_weights
@@ -263,6 +264,23 @@ def test_a_digest_names_no_other_folder(store: Store, tmp_path: Path) -> None:
     assert not list(tmp_path.rglob("*evil*"))
 
 
+def test_a_file_that_cannot_be_read_for_now_is_asked_for_again(
+    store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read, failures = store.run.checkpoints.read, [OSError(errno.EMFILE, "Too many open files")]
+
+    def sometimes(manifest: Manifest) -> bytes:
+        if failures:
+            raise failures.pop()
+        return read(manifest)
+
+    monkeypatch.setattr(store.run.checkpoints, "read", sometimes)
+    with store.served() as address, CheckpointClient(address) as client:
+        assert client.save(100, tmp_path / "got").read_bytes() == store.data
+        assert not store.service.all_evaluated, "it waits for its test"
+    assert store.service.offsets == [0, 0]
+
+
 def half(path: Path) -> None:
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
@@ -279,9 +297,9 @@ def test_a_damaged_checkpoint_is_not_served(
 ) -> None:
     damage(store.run_dir / "checkpoints" / "checkpoint-000000100.safetensors")
     with store.served() as address, CheckpointClient(address) as client:
-        with pytest.raises(LiirError, match=r"checkpoint 100: .*(corrupt|No such file)"):
+        with pytest.raises(DamagedError, match=r"checkpoint 100: .*(corrupt|No such file)"):
             client.save(100, tmp_path / "got")
-        with pytest.raises(LiirError, match=r"checkpoint 100: .*(corrupt|No such file)"):
+        with pytest.raises(DamagedError, match=r"checkpoint 100: .*(corrupt|No such file)"):
             client.get(100)
     assert store.service.offsets == [0, 0], "asked once each: to try again would not help"
     assert not list((tmp_path / "got").glob("checkpoint-*"))

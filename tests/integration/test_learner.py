@@ -25,7 +25,7 @@ from liir_common import checkpoint, seeds
 from liir_common.build import build
 from liir_common.cli import app
 from liir_common.client import CheckpointClient, TrainingClient
-from liir_common.errors import ConfigError, LiirError, MissingError, UnreachableError
+from liir_common.errors import ConfigError, LiirError, MissingError, RefusedError, UnreachableError
 from liir_common.policy import Policy
 from liir_common.replay.load import find_checkpoint
 from liir_common.rollout.play import make_player
@@ -33,6 +33,7 @@ from liir_common.rpc import codec
 from liir_common.rpc.channel import CHANNEL_OPTIONS, connect
 from liir_common.rpc.gen.liir.v1 import checkpoint_pb2, rollout_pb2, rollout_pb2_grpc
 from liir_common.types import Ticket, policy_shapes
+from services.evaluator.evaluator import Evaluator
 from tests.e2e import service
 from tests.faults.proxy import Proxy
 from tests.grpcurl import grpcurl, needs_grpcurl
@@ -132,6 +133,15 @@ def play_batches(address: str, batches: int) -> None:
         for _ in range(4 * batches):
             actor.send(actor.play(actor.order()))
             actor.ack()
+
+
+def test_an_evaluator_that_would_play_other_episodes_ends(learner: tuple[str, Path]) -> None:
+    address, _ = learner
+    other = make_player(service.config("env.map=8m").env)
+    with pytest.raises(
+        RefusedError, match=r"would play other episodes: wanted .* start it from"
+    ):
+        Evaluator(address, PLAYER, other).run()
 
 
 def test_play_stream(learner: tuple[str, Path]) -> None:

@@ -224,6 +224,12 @@ def test_snapshot_and_restore() -> None:
         env.step({a: env.action_space(a).sample() for a in env.agents})
     copy.restore(env.snapshot())
     assert copy.snapshot() == env.snapshot()
+    bare = env.snapshot()
+    for record in bare:
+        del record["goal_x"], record["goal_y"]
+    copy.restore(bare)
+    assert [record["goal_x"] for record in copy.snapshot()] == [record["x"] for record in bare]
+    copy.restore(env.snapshot())
     for agent in env.agents:
         for key, value in env._observations()[agent].items():
             assert np.array_equal(value, copy._observations()[agent][key])

@@ -151,6 +151,21 @@ def test_a_late_ticket_played_after_all_is_not_given_again() -> None:
     assert [ticket.episode_id for _, ticket in give(intake)] == [1, 2, 3]
 
 
+def test_a_late_ticket_stays_with_an_actor_that_asks_again_and_costs_it_nothing() -> None:
+    intake, _ = make_intake()
+    intake.join("a")
+    intake.open(Opening(0, 0, 0.0))
+    intake.ask("a", 2)
+    give(intake, now=0.0)
+    assert intake.expire(given_before=1.0) == 2
+    intake.accept("a", make_trajectory(0))
+    # Episode 1 is with it already; the room that episode 0 left is for another.
+    assert [ticket.episode_id for _, ticket in give(intake, now=2.0)] == [2]
+    assert intake.expire(given_before=2.0) == 0, "it has been given out at 2"
+    intake.accept("a", make_trajectory(1))
+    assert [ticket.episode_id for _, ticket in give(intake)] == [3]
+
+
 def test_what_was_never_ordered_is_refused() -> None:
     intake, _ = make_intake(first_batch=2)
     intake.join("a")

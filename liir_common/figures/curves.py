@@ -184,6 +184,9 @@ def _draw(by_map: dict[str, dict[str, list[Curve]]], output: Path) -> None:
             axes.fill_between(steps / 1e6, mean - deviation, mean + deviation, color=colour, alpha=0.2, lw=0)
         axes.set(title=map_name, xlabel="million environment steps", ylim=(-0.02, 1.02))
         axes.grid(alpha=0.25)
-        axes.legend(loc="lower right", title="method (seeds)")
+        # Below: ten methods leave no room among the curves.
+        axes.legend(
+            loc="upper center", bbox_to_anchor=(0.5, -0.15), ncols=3, frameon=False, title="method (seeds)"
+        )
     panels[0].set_ylabel("greedy win rate, mean ± deviation")
     figure.savefig(output, dpi=120)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import random
 import signal
 import tempfile
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -67,6 +68,10 @@ class Faults:
     def __init__(self, folder: Path, disk: Path, temporary: Path) -> None:
         """Start everything."""
         self.run_dir = disk / "run"
+        self.due = 1
+        """Learner step that the plan has come to"""
+        self._slowness = 0.0
+        self._closed = threading.Event()
         self._disk = disk
         self._random = random.Random(SEED)
         port = service.free_port()
@@ -79,6 +84,14 @@ class Faults:
         self.add("evaluator", "--learner", self._evaluator_link.address, folder=folder)
         actors = ("--set", f"actors.ray_address={ray_address}", "--set", "actors.metrics_port=0")
         self.add("actors", "--learner", self.actors_link.address, *actors, folder=folder)
+        threading.Thread(target=self._hold_back, daemon=True).start()
+
+    def _hold_back(self) -> None:
+        """Slow the actors' link as long as the run is ahead of the plan: in the seconds that some faults
+        take, the actors would play it to its end."""
+        while not self._closed.wait(0.05):
+            ahead = max(0, service.learner_step(self.run_dir) - self.due)
+            self.actors_link.delay_s = max(self._slowness, min(2.0, 0.05 * ahead))
 
     def add(self, name: str, *arguments: str, folder: Path) -> None:
         environment = self._clocks[name].environment if name in self._clocks else None
@@ -112,8 +125,9 @@ class Faults:
         self._evaluator_link.stall(self._random.uniform(1, 16))
 
     def delay_actors(self) -> None:
-        self.actors_link.delay_s = self._random.uniform(0.3, 1.0)
+        self._slowness = self._random.uniform(0.3, 1.0)
         time.sleep(1)
+        self._slowness = 0.0
 
     def kill_actor(self) -> None:
         self.actor().kill()
@@ -178,6 +192,7 @@ class Faults:
 
     def close(self) -> None:
         """End everything."""
+        self._closed.set()
         self.supervisor.end()
         for link in (self.actors_link, self._evaluator_link):
             link.close()
@@ -215,14 +230,11 @@ def inject(faults: Faults, learner_steps: int) -> None:
     names = plan()
     assert len(names) >= 100
     for number, name in enumerate(names):
-        due = 1 + learner_steps * 3 * number // (4 * len(names))
+        faults.due = due = 1 + learner_steps * 3 * number // (4 * len(names))
         service.wait_for(lambda due=due: service.learner_step(faults.run_dir) >= due, f"learner step {due}")
-        # The link is as slow as it takes for the run not to be over before the plan is.
-        ahead = service.learner_step(faults.run_dir) - due
-        faults.actors_link.delay_s = min(2.0, 0.05 * ahead)
-        print(f"{time.monotonic():.1f} s, learner step {due + ahead}: {name}")
+        print(f"{time.monotonic():.1f} s, learner step {service.learner_step(faults.run_dir)}: {name}")
         service.wait_for(lambda name=name: faults.happens(name), name)
-    faults.actors_link.delay_s = 0.0
+    faults.due = learner_steps
 
 
 def test_a_hundred_faults_change_nothing(tmp_path: Path, small_disk: Path) -> None:

@@ -138,9 +138,7 @@ def play_batches(address: str, batches: int) -> None:
 def test_an_evaluator_that_would_play_other_episodes_ends(learner: tuple[str, Path]) -> None:
     address, _ = learner
     other = make_player(service.config("env.map=8m").env)
-    with pytest.raises(
-        RefusedError, match=r"would play other episodes: wanted .* start it from"
-    ):
+    with pytest.raises(RefusedError, match=r"would play other episodes: wanted .* start it from"):
         Evaluator(address, PLAYER, other).run()
 
 

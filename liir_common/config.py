@@ -461,12 +461,18 @@ def load(path: Path | None = None, settings: Sequence[str] = ()) -> Config:
         ) from None
 
 
+_OF_KUBERNETES = re.compile(
+    r"LIIR_(\w+_)?(SERVICE_HOST=.*|SERVICE_PORT(_\w+)?=.*|PORT=\w+://.*|PORT_\d+_[A-Z]+(_\w+)?=.*)"
+)
+"""What every container is told of a service called liir or liir-something; its PORT is a URL."""
+
+
 def _check_environment() -> None:
     """Refuse misspelt variables, of which pydantic takes no notice."""
     known = {f"LIIR_{name}".upper() for name in Config.model_fields} | {"LIIR_TOKENS"}
-    for name in os.environ:
-        if re.match(r"LIIR_(\w+_)?(SERVICE|PORT)(_|$)", name):
-            continue  # Kubernetes tells every container so of a service that is called liir
+    for name, value in os.environ.items():
+        if _OF_KUBERNETES.fullmatch(f"{name}={value}"):
+            continue
         if name.upper().startswith("LIIR_") and name.upper().split("__")[0] not in known:
             close = difflib.get_close_matches(name.upper().split("__")[0], known, n=1)
             hint = f"did you mean {close[0]}?" if close else f"known: {', '.join(sorted(known))}"

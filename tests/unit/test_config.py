@@ -166,11 +166,24 @@ def test_unreadable_files_are_explained(tmp_path: Path) -> None:
 def test_misspelt_variables_are_explained(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("LIIR_TOKENS", "reader secret")
     config.load()
-    for name in ("LIIR_SERVICE_HOST", "LIIR_PORT", "LIIR_GRPC_PORT_6000_TCP_ADDR", "LIIR_GRPC_SERVICE_PORT"):
-        monkeypatch.setenv(name, "10.0.0.1")  # as Kubernetes has it for services of these names
-    config.load()
     monkeypatch.setenv("LIIR_TRAININGS__LAG", "1")
     with pytest.raises(ConfigError, match=r"variable LIIR_TRAININGS__LAG; did you mean LIIR_TRAINING\?"):
+        config.load()
+
+
+def test_variables_of_kubernetes_are_no_settings(monkeypatch: pytest.MonkeyPatch) -> None:
+    told = {
+        "LIIR_SERVICE_HOST": "10.0.0.1",
+        "LIIR_GRPC_SERVICE_PORT": "6000",
+        "LIIR_GRPC_SERVICE_PORT_API": "6000",
+        "LIIR_PORT": "tcp://10.0.0.1:6000",
+        "LIIR_GRPC_PORT_6000_TCP_ADDR": "10.0.0.1",
+    }
+    for name, value in told.items():
+        monkeypatch.setenv(name, value)
+    config.load()
+    monkeypatch.setenv("LIIR_LEARNER_PORT", "6000")
+    with pytest.raises(ConfigError, match="variable LIIR_LEARNER_PORT; did you mean LIIR_LEARNER"):
         config.load()
 
 

@@ -29,7 +29,7 @@ def pack(array: NDArray[np.float32]) -> bytes:
 
 
 def unpack(data: bytes, shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """The array of that shape [R, ...].
+    """The array of that shape [R, ...], read-only as one that shares a message's bytes.
 
     Raises:
         ValueError: the words are not as many as their marks say, or there is a mark beyond a row's end.
@@ -37,6 +37,7 @@ def unpack(data: bytes, shape: tuple[int, ...]) -> NDArray[np.float32]:
     out = np.empty((shape[0], math.prod(shape[1:])), _WORD)
     if len(data) % _WORD.itemsize or not _unpack(np.frombuffer(data, _WORD), out):
         raise ValueError(f"marks for {list(shape)} and a value for each of them, got {len(data)} other bytes")
+    out.flags.writeable = False  # another type to numba, which would compile the checks for both
     return out.view(np.float32).reshape(shape)
 
 

@@ -58,7 +58,7 @@ def encode_tensor(array: Array, encoding: tensor_pb2.Encoding = _RAW) -> tensor_
 def decode_tensor(
     message: tensor_pb2.Tensor, name: str, dtype: np.dtype[np.generic], shape: tuple[int, ...]
 ) -> Array:
-    """Array of exactly the wanted dtype and shape; read-only where it shares the message's bytes."""
+    """Read-only array of exactly the wanted dtype and shape, sharing the message's bytes if it can."""
     got = _DTYPES.get(message.dtype)
     if got != dtype or message.shape != list(shape):
         raise ValueError(

@@ -71,9 +71,8 @@ def exit_on_error() -> Iterator[None]:
 
 def meaning(exit_code: int) -> str:
     """What an exit code says, in one sentence."""
-    texts = {kind.exit_code: kind.__doc__ for kind in LiirError.__subclasses__() if "exit_code" in vars(kind)}
-    if exit_code == 0:
-        return "asked to end"
+    kinds = [kind for kind in LiirError.__subclasses__() if "exit_code" in vars(kind)]
+    texts = {0: "asked to end"} | {kind.exit_code: kind.__doc__ for kind in kinds}
     return (texts.get(exit_code) or "an error that is not foreseen").rstrip(".")
 
 

@@ -273,9 +273,9 @@ class Sweep:
         return self._output / "logs" / f"{run.name}.log"
 
     def _check(self, run: Run) -> None:
-        kept = self._output / run.name / "config.yaml"
-        if not kept.exists():
+        if not holds_run(self._output / run.name):
             return
+        kept = self._output / run.name / "config.yaml"
         there = from_tree(yaml.safe_load(kept.read_text(encoding="utf-8")))
         differ = differences(results.what_matters(there.tree()), results.what_matters(run.config.tree()))
         if run.config.training.total_env_steps > there.training.total_env_steps:

@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from liir_common.rpc import codec
+from liir_common.rpc.gen.liir.v1 import rollout_pb2, tensor_pb2
 from liir_common.types import EnvSpec, Trajectory
 
 SPEC = EnvSpec(
@@ -43,3 +45,14 @@ def make_trajectory(
         truncated=length == spec.episode_limit,
         info={"won": float(episode_id % 2), "score": 0.5},
     )
+
+
+def encode_sample(
+    trajectory: Trajectory, stats: rollout_pb2.ActorStats, compress: bool = False
+) -> rollout_pb2.Trajectory:
+    """As `codec.encode_trajectory`, and packed like a large episode unless it is compressed."""
+    message = codec.encode_trajectory(trajectory, stats, compress)
+    for name in () if compress else ("obs", "state"):
+        tensor = codec.encode_tensor(getattr(trajectory, name), tensor_pb2.ENCODING_CHANGES)
+        getattr(message, name).CopyFrom(tensor)
+    return message

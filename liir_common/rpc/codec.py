@@ -32,6 +32,8 @@ _RAW, _ZSTD, _CHANGES = (
 )
 _REPEATING = ("obs", "state")
 """Arrays of a trajectory that mostly stay as they are from step to step."""
+_WORTH_PACKING = 1 << 16
+"""Bytes; of a smaller array gRPC's copies cost less than finding and undoing the changes."""
 _DIMS_SHOWN = 8
 _DTYPE_CODES = {dtype: code for code, dtype in _DTYPES.items()}
 _EXPLORATIONS = {
@@ -151,9 +153,12 @@ def encode_trajectory(
     trajectory: Trajectory, stats: rollout_pb2.ActorStats, compress: bool = False
 ) -> rollout_pb2.Trajectory:
     """Message with everything the episode produced, packed with zstd if asked."""
-    encodings = dict.fromkeys(_REPEATING, _CHANGES)
-    if compress:
-        encodings = dict.fromkeys(types.TRAJECTORY_ARRAYS, _ZSTD)
+
+    def encoded(name: str) -> tensor_pb2.Tensor:
+        array = getattr(trajectory, name)
+        changes_pay = name in _REPEATING and array.nbytes >= _WORTH_PACKING
+        return encode_tensor(array, _ZSTD if compress else _CHANGES if changes_pay else _RAW)
+
     return rollout_pb2.Trajectory(
         episode_id=trajectory.episode_id,
         policy_version=trajectory.policy_version,
@@ -161,10 +166,7 @@ def encode_trajectory(
         truncated=trajectory.truncated,
         info=list(trajectory.info.values()),
         stats=stats,
-        **{
-            name: encode_tensor(getattr(trajectory, name), encodings.get(name, _RAW))
-            for name in types.TRAJECTORY_ARRAYS
-        },
+        **{name: encoded(name) for name in types.TRAJECTORY_ARRAYS},
     )
 
 

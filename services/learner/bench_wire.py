@@ -92,7 +92,6 @@ def bench_wire(map_name: str, streams: int = 4, batches: int = 40, repeats: int 
     """Medians over `repeats` of the rate and of this process's CPU time per episode, as fast as they come."""
     settings = config.load(None, [f"env.map={map_name}", "training.lag=1"])
     per_repeat = batches * settings.training.batch_episodes
-
     set_up_process(1)
 
     async def measure() -> tuple[list[float], list[float]]:

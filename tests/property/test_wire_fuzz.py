@@ -11,10 +11,10 @@ from liir_common.rollout.playable import check_playable
 from liir_common.rpc import codec
 from liir_common.rpc.gen.liir.v1 import rollout_pb2
 from liir_common.types import policy_shapes
-from tests.samples import SPEC, make_trajectory
+from tests.samples import SPEC, encode_sample, make_trajectory
 
 VALID = {
-    compress: codec.encode_trajectory(
+    compress: encode_sample(
         make_trajectory(), rollout_pb2.ActorStats(play_seconds=1.0), compress
     ).SerializeToString()
     for compress in (False, True)

@@ -35,7 +35,7 @@ from liir_common.rpc.channel import CHANNEL_OPTIONS
 from liir_common.rpc.gen.liir.v1 import checkpoint_pb2, rollout_pb2, tensor_pb2, training_pb2
 from liir_common.types import TRAJECTORY_ARRAYS, EnvSpec, Exploration, Ticket, policy_shapes
 from tests.e2e import service
-from tests.samples import SPEC, make_trajectory
+from tests.samples import SPEC, encode_sample, make_trajectory
 
 BOMB_BYTES = 2**28
 MOST_GROWTH = 200 * 2**20
@@ -49,7 +49,7 @@ DIMENSIONS = (0, 1, 7, 2**31, 2**32 - 1)
 @cache
 def wire_trajectory(spec: EnvSpec, compress: bool) -> bytes:
     stats = rollout_pb2.ActorStats(play_seconds=1.0)
-    return codec.encode_trajectory(make_trajectory(spec=spec), stats, compress).SerializeToString()
+    return encode_sample(make_trajectory(spec=spec), stats, compress).SerializeToString()
 
 
 def trajectory(spec: EnvSpec, compress: bool) -> rollout_pb2.Trajectory:

@@ -11,23 +11,31 @@ from liir_common.rollout import changes
 from liir_common.rpc import codec
 from liir_common.rpc.gen.liir.v1 import rollout_pb2, tensor_pb2
 from liir_common.types import Exploration, Ticket, policy_shapes, trajectories_equal
-from tests.samples import SPEC, make_trajectory
+from tests.samples import SPEC, encode_sample, make_trajectory
 
 STATS = rollout_pb2.ActorStats(play_seconds=0.5, wait_seconds=0.25)
 
 
 def encode(compress: bool = False, **changes: object) -> rollout_pb2.Trajectory:
-    return codec.encode_trajectory(replace(make_trajectory(), **changes), STATS, compress)  # type: ignore[arg-type]
+    return encode_sample(replace(make_trajectory(), **changes), STATS, compress)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("compress", [False, True])
 @pytest.mark.parametrize("length", [1, 6, 9])
 def test_trajectory_round_trip(compress: bool, length: int) -> None:
     trajectory = make_trajectory(3, 2, length)
-    wire = codec.encode_trajectory(trajectory, STATS, compress).SerializeToString()
+    wire = encode_sample(trajectory, STATS, compress).SerializeToString()
     assert trajectories_equal(
         codec.decode_trajectory(rollout_pb2.Trajectory.FromString(wire), SPEC), trajectory
     )
+
+
+def test_only_large_arrays_are_packed() -> None:
+    spec = replace(SPEC, obs_dim=2000)
+    message = codec.encode_trajectory(make_trajectory(spec=spec), STATS)
+    assert message.obs.encoding == tensor_pb2.ENCODING_CHANGES
+    assert message.state.encoding == tensor_pb2.ENCODING_RAW
+    assert trajectories_equal(codec.decode_trajectory(message, spec), make_trajectory(spec=spec))
 
 
 def test_what_repeats_is_not_sent() -> None:

@@ -12,6 +12,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from liir_common import kernel_cache
+from liir_common.rollout.tile import write_tile
 from liir_common.types import FloatArray
 
 kernel_cache.install()
@@ -54,27 +55,47 @@ def sigmoid(x):
     return _HALF + _HALF * tanh(_HALF * x)
 
 
-@njit(cache=True, fastmath={"contract"})
-def add_product(x, weight, out):
-    """out[n, columns] += x[n, rows] @ weight[rows, columns].
+@njit(inline="always")
+def _columns(x, weight, start, out, column, vectors, lanes):
+    """The vectors·lanes columns of `_product` from `column` on."""
+    n = len(out)
+    by_four = n - n % 4
+    for a in range(0, by_four, 4):
+        write_tile(4, vectors, lanes, x, weight, start, out, a, column)
+    if n - by_four == 3:
+        write_tile(3, vectors, lanes, x, weight, start, out, by_four, column)
+    elif n - by_four == 2:
+        write_tile(2, vectors, lanes, x, weight, start, out, by_four, column)
+    elif n - by_four == 1:
+        write_tile(1, vectors, lanes, x, weight, start, out, by_four, column)
 
-    Eight rows of the weight serve all n while they are in the first-level cache, and each pass over `out`
-    does eight fused multiply-adds per load and store.
-    """
-    n, rows = x.shape
-    columns = weight.shape[1]
-    by_eight = rows - rows % 8
-    for i in range(0, by_eight, 8):
-        for a in range(n):
-            x0, x1, x2, x3 = x[a, i], x[a, i + 1], x[a, i + 2], x[a, i + 3]
-            x4, x5, x6, x7 = x[a, i + 4], x[a, i + 5], x[a, i + 6], x[a, i + 7]
-            for j in range(columns):
-                # From left to right, so that each product has one sum to fuse with.
-                two = out[a, j] + x0 * weight[i, j] + x1 * weight[i + 1, j]
-                four = two + x2 * weight[i + 2, j] + x3 * weight[i + 3, j]
-                six = four + x4 * weight[i + 4, j] + x5 * weight[i + 5, j]
-                out[a, j] = six + x6 * weight[i + 6, j] + x7 * weight[i + 7, j]
-    for i in range(by_eight, rows):
-        for a in range(n):
-            for j in range(columns):
-                out[a, j] += x[a, i] * weight[i, j]
+
+@njit(inline="always")
+def _product(x, weight, start, out):
+    """Tiles of 4 x 24 fill the sixteen vector registers of AVX2: twelve sums, three weights and a factor."""
+    columns = out.shape[1]
+    j = 0
+    while columns - j >= 24:
+        _columns(x, weight, start, out, j, 3, 8)
+        j += 24
+    if columns - j >= 16:
+        _columns(x, weight, start, out, j, 2, 8)
+        j += 16
+    if columns - j >= 8:
+        _columns(x, weight, start, out, j, 1, 8)
+        j += 8
+    while columns > j:
+        _columns(x, weight, start, out, j, 1, 1)
+        j += 1
+
+
+@njit(cache=True, nogil=True)
+def add_product(x, weight, out):
+    """out[n, columns] += x[n, rows] @ weight[rows, columns]."""
+    _product(x, weight, out, out)
+
+
+@njit(cache=True, nogil=True)
+def affine(x, weight, bias, out):
+    """out[n, columns] = bias[columns] + x[n, rows] @ weight[rows, columns]."""
+    _product(x, weight, np.broadcast_to(bias, out.shape), out)

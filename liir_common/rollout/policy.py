@@ -7,7 +7,7 @@ import numpy as np
 from numba import njit
 
 from liir_common import rng
-from liir_common.rollout.dense import add_product, aligned, sigmoid, tanh
+from liir_common.rollout.dense import add_product, affine, aligned, sigmoid, tanh
 from liir_common.types import EnvSpec, Exploration, FloatArray, Weights, policy_shapes
 
 SOFTMAX_FLOOR, EPSILON_GREEDY, GREEDY = 0, 1, 2
@@ -119,15 +119,6 @@ def _check(weights: Weights, shapes: dict[str, tuple[int, ...]]) -> None:
 _ZERO = np.float32(0)
 
 
-@njit(cache=True)
-def _affine(x, weight, bias, out):
-    """out[n, columns] = x[n, rows] @ weight[rows, columns] + bias[columns]."""
-    for a in range(out.shape[0]):
-        for j in range(out.shape[1]):
-            out[a, j] = bias[j]
-    add_product(x, weight, out)
-
-
 @njit(cache=True, fastmath={"contract"})
 def _embed(policy, obs, last_actions):
     """ReLU of the first layer into `features`; one-hot inputs are additions of a row."""
@@ -156,8 +147,8 @@ def _gates(sums, units):
 def _recur(policy, hidden):
     """One step of torch's GRUCell on `features`: hidden[n, H] in place."""
     units = hidden.shape[1]
-    _affine(policy.features, policy.gru_input, policy.gru_input_bias, policy.input_gates)
-    _affine(hidden, policy.gru_hidden, policy.gru_hidden_bias, policy.hidden_gates)
+    affine(policy.features, policy.gru_input, policy.gru_input_bias, policy.input_gates)
+    affine(hidden, policy.gru_hidden, policy.gru_hidden_bias, policy.hidden_gates)
     for a in range(len(hidden)):
         x_reset, x_update, x_new = _gates(policy.input_gates[a], units)
         h_reset, h_update, h_new = _gates(policy.hidden_gates[a], units)
@@ -226,7 +217,7 @@ def act(policy, hidden, obs, last_actions, mask, choice, actions, log_mu):
     """
     _embed(policy, obs, last_actions)
     _recur(policy, hidden)
-    _affine(hidden, policy.fc2, policy.fc2_bias, policy.logits)
+    affine(hidden, policy.fc2, policy.fc2_bias, policy.logits)
     for a in range(len(hidden)):
         actions[a], probability = _sample(policy.logits[a], mask[a], rng.uniform(choice.stream), choice)
         log_mu[a] = math.log(probability)

@@ -9,7 +9,6 @@ import pytest
 import torch
 from numba import jit
 
-from liir_common.rollout.dense import add_product
 from liir_common.rollout.policy import (
     EPSILON_GREEDY,
     GREEDY,
@@ -229,14 +228,10 @@ def test_packing_copies() -> None:
     assert not any(np.shares_memory(array, given) for array in policy for given in weights.values())
 
 
-@pytest.mark.parametrize(("kernel", "instruction"), [(add_product, "fmul"), (_recur, "fdiv")])
-def test_the_inner_loops_are_compiled_to_vectors(kernel: Any, instruction: str) -> None:
+def test_the_loop_over_units_is_compiled_to_vectors() -> None:
     policy = pack(random_weights(SPEC, 64, 0), SPEC)
     # Code from numba's cache cannot be inspected.
-    compiled = jit(**kernel.targetoptions)(kernel.py_func)
-    if kernel is add_product:
-        compiled(policy.features, policy.gru_input, policy.input_gates)
-    else:
-        compiled(policy, np.zeros((3, 64), np.float32))
+    compiled = jit(**_recur.targetoptions)(_recur.py_func)
+    compiled(policy, np.zeros((3, 64), np.float32))
     (code,) = compiled.inspect_llvm().values()
-    assert re.search(rf"{instruction} contract <\d+ x float>", code)
+    assert re.search(r"fdiv contract <\d+ x float>", code)

@@ -87,17 +87,18 @@ class Intake:
         """Match tickets with actors, oldest episode and longest wait first.
 
         An actor gets all that it can hold before the next gets any, since each needs the policy; one whose
-        episodes take long asks for one ticket at a time.
+        episodes take long asks for one ticket at a time. Who is late with a ticket has it still.
         """
         while self._asking and (ticket := self._next_ticket()):
-            actor = self._asking[0]
-            if ticket.episode_id in self._held[actor]:  # it is late with that one, and has it still
-                self._held[actor][ticket.episode_id] = now
+            episode = ticket.episode_id
+            actor = next((actor for actor in self._asking if episode not in self._held[actor]), None)
+            if actor is None:
+                self._held[self._asking[0]][episode] = now  # and is late again after as long
                 continue
             self._credits[actor] -= 1
             if not self._credits[actor]:
-                self._asking.popleft()
-            self._held[actor][ticket.episode_id] = now
+                self._asking.remove(actor)
+            self._held[actor][episode] = now
             yield actor, ticket
 
     def _next_ticket(self) -> Ticket | None:

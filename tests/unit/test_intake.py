@@ -151,6 +151,22 @@ def test_a_late_ticket_played_after_all_is_not_given_again() -> None:
     assert [ticket.episode_id for _, ticket in give(intake)] == [1, 2, 3]
 
 
+def test_a_late_ticket_passes_by_the_actor_that_has_it_and_could_hold_more() -> None:
+    """An actor that hangs must not keep from others what it is late with by asking first."""
+    intake, delivered = make_intake()
+    for actor in "ab":
+        intake.join(actor)
+        intake.ask(actor, 3)
+    intake.open(Opening(0, 0, 0.0))
+    assert [actor for actor, _ in give(intake)] == ["a", "a", "a", "b"]
+    for episode in range(3):
+        intake.accept("a", make_trajectory(episode))
+    assert intake.expire(given_before=1.0) == 1
+    assert [(actor, ticket.episode_id) for actor, ticket in give(intake, 2.0)] == [("a", 3)]
+    intake.accept("a", make_trajectory(3))
+    assert delivered == [[0, 1, 2, 3]]
+
+
 def test_a_late_ticket_stays_with_an_actor_that_asks_again_and_costs_it_nothing() -> None:
     intake, _ = make_intake()
     intake.join("a")

@@ -110,7 +110,9 @@ class CheckpointStore:
         kept = _episodes(names, r"checkpoint-(\d+)\.json")
         self._manifests: list[Manifest] = []
         for episode in sorted(kept):
-            self._manifests.append(_sharing(self.read_manifest(episode), self._manifests))
+            self._manifests.append(
+                _sharing(self._read_manifest(self._manifest_path(episode)), self._manifests)
+            )
         deleted = filter(None, (re.fullmatch(r"deleted-(\d+)-(\w+)\.json", name) for name in names))
         self._deleted = {int(match[1]): match[2] for match in deleted if int(match[1]) not in kept}
         for episode in _episodes(names, r"deleted-(\d+)\.json") - kept:  # as older builds named them
@@ -193,14 +195,6 @@ class CheckpointStore:
         data: bytes = self._fs.cat_file(self._weights_path(manifest.episode))
         unpack(data, manifest.sha256)
         return data
-
-    def read_manifest(self, episode: int) -> Manifest:
-        """Read one manifest from the store.
-
-        Raises:
-            CorruptError: the file is not a manifest.
-        """
-        return self._read_manifest(self._manifest_path(episode))
 
     def _read_manifest(self, path: str) -> Manifest:
         try:

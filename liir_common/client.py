@@ -107,6 +107,7 @@ class CheckpointClient:
         Raises:
             MissingError: there is no such checkpoint, or it was deleted.
             DamagedError: the learner's copy is damaged.
+            RefusedError: the learner refused the call, and would again.
             UnreachableError: the connection kept breaking.
             CorruptError: the bytes that came do not have the manifest's digest.
         """
@@ -122,7 +123,8 @@ class CheckpointClient:
         same one to the same folder, this waits. A checkpoint is there when its manifest is, which is
         written last. Raises what `download` raises.
         """
-        frozen = self.find(episode)
+        with refusals_explained():
+            frozen = self.find(episode)
         if not re.fullmatch("[0-9a-f]{64}", frozen.sha256):
             raise CorruptError(f"checkpoint {episode}: wanted a SHA-256 in hex, got {frozen.sha256!r}")
         folder.mkdir(parents=True, exist_ok=True)
@@ -154,11 +156,11 @@ class CheckpointClient:
         """The checkpoint frozen after `episode` episodes.
 
         Raises:
-            LiirError: there is none.
+            MissingError: there is none.
         """
         frozen = next(self.list(after_episode=max(0, episode - 1)), None)
         if frozen is None or frozen.episode != episode:
-            raise LiirError(
+            raise MissingError(
                 f"no checkpoint of episode {episode}; `liir checkpoints list` says which there are"
             )
         return frozen
@@ -218,7 +220,7 @@ class CheckpointClient:
                 return self._append_rest(episode, file)
             except grpc.RpcError as error:
                 if error.code() not in AWAY:
-                    kind = _ERRORS.get(error.code(), LiirError)
+                    kind = _ERRORS.get(error.code(), RefusedError)
                     raise kind(f"checkpoint {episode}: {error.details()}") from None
             if file.tell() > begin:
                 failures, waits = 0, backoffs()

@@ -51,6 +51,12 @@ class StorageError(LiirError):
     exit_code = 6
 
 
+class DivergedError(LiirError):
+    """Learning has diverged, and would again."""
+
+    exit_code = 7
+
+
 class DiskFullError(StorageError):
     """There is no room for what should be written; later there may be."""
 

@@ -23,11 +23,12 @@ from rich.console import Console
 
 from liir_common import options
 from liir_common.client import CheckpointClient, TrainingClient
-from liir_common.config import Config, SecurityConfig
+from liir_common.config import Config, SecurityConfig, holds_run
 from liir_common.display import Display, make_display, phase_name
 from liir_common.errors import (
     ConfigError,
     CorruptError,
+    DivergedError,
     LiirError,
     RefusedError,
     StorageError,
@@ -50,7 +51,9 @@ _HOME_S = 10.0
 _RESTARTS, _RESTARTS_WITHIN_S = 3, 300.0
 _PR_SET_PDEATHSIG = 1
 _LAST_LINES, _LAST_BYTES = 5, 65_536
-_IN_VAIN = tuple(kind.exit_code for kind in (ConfigError, CorruptError, RefusedError, StorageError))
+_IN_VAIN = tuple(
+    kind.exit_code for kind in (ConfigError, CorruptError, RefusedError, StorageError, DivergedError)
+)
 """Codes of processes that would only end in the same way again."""
 _EVENT = re.compile(r'"event": "([^"]*)"')
 _EXCEPTION = re.compile(r"^(?:error: |[\w.]*(?:Error|Exception)\b).*$", re.MULTILINE)
@@ -215,8 +218,8 @@ class Launcher:
         for signum in (signal.SIGINT, signal.SIGTERM):
             signal.signal(signum, self._on_signal)
         try:
-            address = self._start(evaluate)
-            self._watch(address)
+            if address := self._start(evaluate):
+                self._watch(address)
         finally:
             for service in (self._evaluator, self._actors, self._learner):
                 service.end()
@@ -229,9 +232,12 @@ class Launcher:
     def _on_signal(self, signum: int, frame: FrameType | None) -> None:
         self._stop_signal = signum
 
-    def _start(self, evaluate: bool) -> str:
+    def _start(self, evaluate: bool) -> str | None:
+        """Start all; where the learner serves, or None if a signal asked to stop before it did."""
         self._learner.start()
         address = self._wait_for_learner()
+        if address is None:
+            return None
         # A learner that is started again must be found where it was.
         self._learner.arguments += ["--set", f"learner.port={address.rpartition(':')[2]}"]
         if "--resume" not in self._learner.arguments:
@@ -241,9 +247,11 @@ class Launcher:
             service.start()
         return address
 
-    def _wait_for_learner(self) -> str:
+    def _wait_for_learner(self) -> str | None:
         deadline = time.monotonic() + _START_S
         while time.monotonic() < deadline:
+            if self._stop_signal:
+                return None
             if address := self._learner.address():
                 return address
             if self._learner.exit_code is not None:
@@ -360,6 +368,8 @@ def train(
     run_dir = run_dir or Path("runs") / _run_name(config)
     launcher = make_launcher(Request(run_dir, config, file, settings, resume))
     launcher.run(config.evaluation.enabled)
+    if launcher.stop_signal and not holds_run(run_dir):  # before there was anything to go on with
+        raise SystemExit(128 + launcher.stop_signal)
     with storage_explained(run_dir):
         summary = write_report(run_dir)
     print_summary(run_dir, summary)

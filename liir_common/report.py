@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -10,7 +11,8 @@ from typing import Any
 
 import yaml
 
-from liir_common.config import leaves
+from liir_common.config import EnvConfig, leaves
+from liir_common.errors import ConfigError
 from liir_common.files import csv_text, read_table, write_atomic
 
 _LEVEL = 0.9
@@ -81,7 +83,15 @@ def print_summary(run_dir: Path, summary: Summary) -> None:
 
 
 def write_results(run_dirs: Sequence[Path], output: Path) -> None:
-    """Gather runs into `output`: runs.csv (a row per run), curves.csv (a row per evaluation), winrate.png."""
+    """Gather runs into `output`: runs.csv (a row per run), curves.csv (a row per evaluation), winrate.png.
+
+    Raises:
+        ConfigError: two run directories have the same name.
+    """
+    run_dirs = [run_dir.resolve() for run_dir in run_dirs]
+    names = Counter(run_dir.name for run_dir in run_dirs)
+    if twice := sorted(name for name, count in names.items() if count > 1):
+        raise ConfigError(f"wanted runs with names of their own, got {', '.join(twice)} more than once")
     output.mkdir(parents=True, exist_ok=True)
     configs = [yaml.safe_load((run_dir / "config.yaml").read_text(encoding="utf-8")) for run_dir in run_dirs]
     groups: dict[str, list[Path]] = {}
@@ -91,15 +101,20 @@ def write_results(run_dirs: Sequence[Path], output: Path) -> None:
     for run_dir, config in zip(run_dirs, configs, strict=True):
         run = json.loads((run_dir / "run.json").read_text())
         label = method_label(config["algorithm"])
-        about = {"run": run_dir.name, "method": label, "map": config["env"]["map"], "seed": config["seed"]}
+        about = {
+            "run": run_dir.name,
+            "method": label,
+            "map": EnvConfig(**config["env"]).label,
+            "seed": config["seed"],
+        }
         runs.append({**about, "commit": run["git"], **asdict(summarise(run_dir))})
         curves += [
             {"run": run_dir.name} | {column: test[column] for column in _CURVE}
             for test in read_table(run_dir / "evaluations.csv")
         ]
         write_atomic(output / f"{run_dir.name}.yaml", (run_dir / "config.yaml").read_bytes())
-    for name, rows in (("runs", runs), ("curves", curves)):
-        write_atomic(output / f"{name}.csv", csv_text(rows).encode())
+    write_atomic(output / "runs.csv", csv_text(runs).encode())
+    write_atomic(output / "curves.csv", csv_text(curves, ("run", *_CURVE)).encode())
     plot_win_rate(groups, output / "winrate.png")
 
 
@@ -113,7 +128,7 @@ def method_label(algorithm: Mapping[str, Any]) -> str:
 def curve_labels(configs: Sequence[Mapping[str, Any]]) -> list[str]:
     """The method of each, its map where there are several, and its differences from others of that method."""
     methods = [method_label(config["algorithm"]) for config in configs]
-    maps = [config["env"]["map"] for config in configs]
+    maps = [EnvConfig(**config["env"]).label for config in configs]
     settings = [leaves(config["algorithm"]) for config in configs]
     labels = []
     for method, map_name, own in zip(methods, maps, settings, strict=True):

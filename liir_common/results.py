@@ -12,7 +12,7 @@ from typing import Any
 
 import yaml
 
-from liir_common.config import holds_run
+from liir_common.config import EnvConfig, holds_run
 from liir_common.errors import ConfigError
 from liir_common.files import read_table
 from liir_common.report import method_label
@@ -46,8 +46,8 @@ def config_digest(tree: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(what_matters(tree), sort_keys=True).encode()).hexdigest()[:12]
 
 
-def rows(run_dir: Path, method: str = "") -> list[dict[str, Any]]:
-    """The rows of one run, by episode; `method` replaces the name that its configuration gives it.
+def rows(run_dir: Path, method: str = "", map_name: str = "") -> list[dict[str, Any]]:
+    """The rows of one run, by episode; `method` and `map_name` replace what its configuration calls them.
 
     Raises:
         ConfigError: there is no run.
@@ -58,7 +58,7 @@ def rows(run_dir: Path, method: str = "") -> list[dict[str, Any]]:
     about = {
         "run": run_dir.name,
         "method": method or method_label(tree["algorithm"]),
-        "map": tree["env"]["map"],
+        "map": map_name or EnvConfig(**tree["env"]).label,
         "seed": tree["seed"],
         "commit": json.loads((run_dir / "run.json").read_text())["git"],
         "config_digest": config_digest(tree),

@@ -26,3 +26,8 @@ def derive(seed: int, index: int) -> int:
 def episode_seed(run_seed: int, domain: int, episode_id: int) -> int:
     """Seed of episode `episode_id` of a run: it depends on nothing else."""
     return derive(derive(run_seed, domain), episode_id)
+
+
+def evaluation_seed(run_seed: int, checkpoint: int, index: int) -> int:
+    """Seed of a test episode of a checkpoint, greedy or sampled."""
+    return derive(episode_seed(run_seed, EVALUATION, checkpoint), index)

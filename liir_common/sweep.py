@@ -29,6 +29,7 @@ from liir_common.config import Config, Section, differences, from_tree, holds_ru
 from liir_common.errors import ConfigError
 from liir_common.files import csv_text, read_table, write_atomic
 from liir_common.launch import die_with_parent
+from liir_common.rpc.tokens import VARIABLE
 
 _POLL_S = 0.5
 # Several runs share a machine, so every server takes a free port.
@@ -37,8 +38,8 @@ _FREE_PORTS = {
     "actors": {"metrics_port": 0},
     "evaluation": {"metrics_port": 0},
 }
-_WHERE_IT_RUNS = ("actors", "learner")
-"""Sections that a run takes anew when it goes on, maybe on another machine."""
+_WHERE_IT_RUNS = ("actors", "checkpoints", "learner", "metrics", "security")
+"""Sections that a run takes anew when it goes on, maybe on another machine or with less room."""
 
 
 class SweepConfig(Section):
@@ -195,8 +196,8 @@ class Sweep:
                 stdout=file,
                 stderr=file,
                 stdin=subprocess.DEVNULL,
-                # The run's configuration is complete: variables for this process are not meant for it.
-                env={name: value for name, value in os.environ.items() if not name.startswith("LIIR_")},
+                # The run's configuration is complete but for tokens: settings in variables are not for it.
+                env={k: v for k, v in os.environ.items() if k == VARIABLE or not k.startswith("LIIR_")},
                 process_group=0,
                 preexec_fn=die_with_parent,
             )
@@ -243,7 +244,7 @@ class Sweep:
     def _write(self) -> None:
         """Gather every run of the plan that has begun, whenever it ran, beside the sweep's other parts."""
         begun = [run for run in self._runs if holds_run(self._output / run.name)]
-        rows = [row for run in begun for row in results.rows(self._output / run.name, run.method)]
+        rows = [row for run in begun for row in results.rows(self._output / run.name, run.method, run.map)]
         self._replace_rows("results.csv", rows, results.COLUMNS)
         self._replace_rows("runs.csv", [self._row(run) for run in self._runs])
 

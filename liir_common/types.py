@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from enum import StrEnum
 from typing import Any
 
@@ -237,15 +237,3 @@ def _pad(trajectories: Sequence[Trajectory], name: str, steps: int) -> NDArray[n
         array = getattr(trajectory, name)
         row[: len(array)] = array
     return out
-
-
-def trajectories_equal(a: Trajectory, b: Trajectory) -> bool:
-    """Whether two trajectories agree in every byte."""
-    for field in fields(Trajectory):
-        x, y = getattr(a, field.name), getattr(b, field.name)
-        if isinstance(x, np.ndarray):
-            if x.dtype != y.dtype or x.shape != y.shape or x.tobytes() != y.tobytes():
-                return False
-        elif x != y:
-            return False
-    return True

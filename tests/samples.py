@@ -1,5 +1,7 @@
 """Made-up environments and episodes for tests that need the shapes, not the game."""
 
+from dataclasses import fields
+
 import numpy as np
 
 from liir_common.rpc import codec
@@ -56,3 +58,15 @@ def encode_sample(
         tensor = codec.encode_tensor(getattr(trajectory, name), tensor_pb2.ENCODING_CHANGES)
         getattr(message, name).CopyFrom(tensor)
     return message
+
+
+def trajectories_equal(a: Trajectory, b: Trajectory) -> bool:
+    """Whether two trajectories agree in every byte."""
+    for field in fields(Trajectory):
+        x, y = getattr(a, field.name), getattr(b, field.name)
+        if isinstance(x, np.ndarray):
+            if x.dtype != y.dtype or x.shape != y.shape or x.tobytes() != y.tobytes():
+                return False
+        elif x != y:
+            return False
+    return True

@@ -10,7 +10,7 @@ import typer
 from liir_common import options
 from liir_common.cli.shared import Json, Map, print_result
 
-bench = typer.Typer(no_args_is_help=True, help="Measure speed; medians of CPU time on this machine.")
+bench = typer.Typer(no_args_is_help=True, help="Measure speed on this machine; medians.")
 
 
 @bench.command("sim")

@@ -56,7 +56,7 @@ def list_checkpoints(
 @checkpoints.command("watch")
 def watch_checkpoints(
     learner: options.Learner,
-    after: int = 0,
+    after: Annotated[int, typer.Option(min=0, help="Episode to go on after.")] = 0,
     map_name: OnMap = "",
     config: options.ConfigFile = None,
     settings: options.Settings = None,

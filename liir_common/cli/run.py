@@ -77,11 +77,11 @@ def health(
     learner: options.Learner, config: options.ConfigFile = None, settings: options.Settings = None
 ) -> None:
     """Exit with 0 if a learner serves, with 3 if it does not; for health checks."""
-    from liir_common.client import TrainingClient
+    from liir_common.client import TrainingClient, refusals_explained
     from liir_common.rpc.tokens import Role
 
     security = options.load_security(config, settings)
-    with TrainingClient(learner, 3, security, Role.READER) as client:
+    with TrainingClient(learner, 3, security, Role.READER) as client, refusals_explained():
         if not client.serving():
             raise UnreachableError(f"the learner at {learner} is leaving")
 

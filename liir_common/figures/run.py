@@ -36,6 +36,10 @@ class Frozen:
     policy: Weights
     r_in: IntrinsicReward
 
+    def evaluation_seed(self, index: int) -> int:
+        """Of the evaluator's test episode of that index."""
+        return seeds.evaluation_seed(self.config.seed, self.episode, index)
+
     def about(self) -> dict[str, object]:
         """What a figure says about where it is from."""
         return {"run": self.run, "checkpoint": self.episode, "commit": self.commit, "sha256": self.sha256}
@@ -83,9 +87,8 @@ def play(frozen: Frozen, indices: range, mode: str, epsilon: float = 0.0) -> Ite
             "trained it"
         )
     player.load(frozen.policy)
-    base = seeds.episode_seed(frozen.config.seed, seeds.EVALUATION, frozen.episode)
     for index in indices:
-        yield player.play(Ticket(index, 0, seeds.derive(base, index), MODES[mode], epsilon))
+        yield player.play(Ticket(index, 0, frozen.evaluation_seed(index), MODES[mode], epsilon))
 
 
 def taken(r_in: FloatArray, trajectory: Trajectory) -> FloatArray:
@@ -116,9 +119,8 @@ def battles(frozen: Frozen, indices: range, mode: str) -> Iterator[Battle]:
         raise ConfigError(f"{frozen.run} plays {frozen.spec.name}; this figure wants a run on a battle map")
     options: dict[str, Any] = dict(frozen.config.env.options)
     env = parallel_env(frozen.config.env.map, **options)
-    base = seeds.episode_seed(frozen.config.seed, seeds.EVALUATION, frozen.episode)
     for trajectory in play(frozen, indices, mode):
-        env.reset(seed=seeds.derive(base, trajectory.episode_id))
+        env.reset(seed=frozen.evaluation_seed(trajectory.episode_id))
         units = [env.snapshot()]
         for actions in trajectory.actions:
             env.step(dict(zip(env.agents, actions, strict=True)))

@@ -88,7 +88,7 @@ class LoopPlayer(Player):
                 f"{self.spec.name}: env.agents is empty after {length} steps, but not all agents were "
                 f"terminated or truncated: {dict(terminations)}, {dict(truncations)}"
             )
-        last = next(iter(infos.values()))
+        last = next(iter(infos.values()), {})
         missing = [key for key in self.spec.info_keys if key not in last]
         if missing:
             raise ValueError(f"{self.spec.name}: the last info wants {missing}, got {sorted(last)}")
@@ -163,13 +163,18 @@ def loop_spec(env: Env, name: str, options: Mapping[str, Any]) -> EnvSpec:
     the version is the name in the metadata, which ends in one.
 
     Raises:
-        ValueError: agents differ in their spaces, a space is of an unsupported kind, or no limit is
-            stated.
+        ValueError: agents differ in their spaces, a space is of an unsupported kind, no limit is stated, or
+            a figure is called like one that every episode has.
     """
     game = env.unwrapped
     limit = getattr(game, "episode_limit", getattr(game, "max_cycles", None))
     if limit is None:
         raise ValueError(f"{name}: wanted the most steps it plays as attribute episode_limit or max_cycles")
+    info_keys = tuple(getattr(game, "info_keys", ()))
+    if taken := sorted({"return", "length"} & set(info_keys)):
+        raise ValueError(
+            f"{name}: info_keys: {', '.join(taken)} is what every episode has; wanted other names"
+        )
     n_agents, obs_dim, n_actions = team_sizes(env, name)
     return EnvSpec(
         name=name,
@@ -180,7 +185,7 @@ def loop_spec(env: Env, name: str, options: Mapping[str, Any]) -> EnvSpec:
         obs_dim=obs_dim,
         state_dim=_state_dim(env, np.zeros((n_agents, obs_dim), np.float32)),
         episode_limit=int(limit),
-        info_keys=tuple(getattr(game, "info_keys", ())),
+        info_keys=info_keys,
     )
 
 

@@ -8,11 +8,13 @@ from pathlib import Path
 
 from liir_common.config import SecurityConfig
 from liir_common.errors import ConfigError
-from liir_common.rpc.tokens import Role, Tokens
+from liir_common.rpc.tokens import VARIABLE, Role, Tokens
 
 
 def pack(security: SecurityConfig, role: Role | None = None) -> dict[str, bytes]:
     """Contents of the files by key of the section; for a client of `role`, only the token it will send.
+
+    Tokens may be in the environment instead.
 
     Raises:
         ConfigError: a file cannot be read.
@@ -21,6 +23,8 @@ def pack(security: SecurityConfig, role: Role | None = None) -> dict[str, bytes]
     if role is not None and (tokens := Tokens(security.tokens)):
         own = tokens.own(role)
         contents["tokens"] = f"{own.role} {own.secret}\n".encode()
+    elif role is None and (text := os.environ.get(VARIABLE)) and not security.tokens:
+        contents["tokens"] = text.encode()
     return contents
 
 

@@ -16,7 +16,15 @@ from liir_common import types
 from liir_common.rollout import changes
 from liir_common.rollout.playable import check_playable
 from liir_common.rpc.gen.liir.v1 import rollout_pb2, tensor_pb2
-from liir_common.types import EnvSpec, Exploration, Ticket, Trajectory, Weights
+from liir_common.types import (
+    TRAJECTORY_ARRAYS,
+    EnvSpec,
+    Exploration,
+    Ticket,
+    Trajectory,
+    Weights,
+    expected_shape,
+)
 
 Array = NDArray[np.generic]
 
@@ -147,6 +155,14 @@ def decode_ticket(message: rollout_pb2.Ticket) -> Ticket:
     if exploration is None:
         raise ValueError(f"ticket: wanted an exploration this build knows, got {message.exploration}")
     return Ticket(message.episode_id, message.policy_version, message.seed, exploration, message.epsilon)
+
+
+def largest_episode(spec: EnvSpec) -> int:
+    """Bytes of the arrays of an episode that lasts to the limit."""
+    return sum(
+        math.prod(expected_shape(name, spec, spec.episode_limit)) * np.dtype(dtype).itemsize
+        for name, (dtype, _) in TRAJECTORY_ARRAYS.items()
+    )
 
 
 def encode_trajectory(

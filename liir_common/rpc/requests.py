@@ -10,7 +10,7 @@ from liir_common.rpc.gen.liir.v1 import rollout_pb2
 Outgoing = queue.SimpleQueue[rollout_pb2.PlayRequest | None]
 """What an actor has to say; None ends its side of the stream."""
 
-_TOGETHER_BYTES = 1 << 20
+TOGETHER_BYTES = 1 << 20
 """A message that is larger than this already takes no more with it."""
 
 
@@ -19,7 +19,7 @@ def gather(trajectories: Iterable[rollout_pb2.Trajectory]) -> Iterator[rollout_p
     request = rollout_pb2.PlayRequest()
     for trajectory in trajectories:
         request.trajectories.append(trajectory)
-        if request.ByteSize() >= _TOGETHER_BYTES:
+        if request.ByteSize() >= TOGETHER_BYTES:
             yield request
             request = rollout_pb2.PlayRequest()
     if request.trajectories:
@@ -29,7 +29,7 @@ def gather(trajectories: Iterable[rollout_pb2.Trajectory]) -> Iterator[rollout_p
 def put_together(outgoing: Outgoing) -> Iterator[rollout_pb2.PlayRequest]:
     """The messages of `outgoing`, those that wait together in one."""
     while (request := outgoing.get()) is not None:
-        while not outgoing.empty() and request.ByteSize() < _TOGETHER_BYTES:
+        while not outgoing.empty() and request.ByteSize() < TOGETHER_BYTES:
             more = outgoing.get()
             if more is None:
                 yield request

@@ -134,6 +134,7 @@ class Server:
         _check_exposure(host, insecure, tls=credentials is not None, tokens=bool(tokens))
         interceptors = (ErrorInterceptor(), *((AuthInterceptor(tokens),) if tokens else ()))
         self.grpc = grpc.aio.server(interceptors=interceptors, options=_OPTIONS)
+        host = _bracketed(host)
         address = f"{host}:{port}"
         try:
             self.port: int = (
@@ -143,7 +144,7 @@ class Server:
             )
         except RuntimeError:
             raise ConfigError(
-                f"cannot listen on {host}:{port}: the port is taken or the address is not this machine's; "
+                f"cannot listen on {address}: the port is taken or the address is not this machine's; "
                 "choose another with --set learner.port=N (0 takes a free one)"
             ) from None
         # Every interface is no address to call; from this machine loopback is, and the certificate's.
@@ -196,10 +197,15 @@ def _check_exposure(host: str, insecure: bool, tls: bool, tokens: bool) -> None:
     )
 
 
+def _bracketed(host: str) -> str:
+    """IPv6 addresses in brackets, or gRPC takes their last part for the port."""
+    return f"[{host}]" if ":" in host and not host.startswith("[") else host
+
+
 def _is_loopback(host: str) -> bool:
     if host == "localhost":
         return True
     try:
-        return ipaddress.ip_address(host).is_loopback
+        return ipaddress.ip_address(host.strip("[]")).is_loopback
     except ValueError:
         return False

@@ -66,8 +66,8 @@ class Fleet:
         self._members = [_Member(f"actor-{i:03d}") for i in range(self._count)]
         self._stopping = False
         self._waits = {member.name: backoffs() for member in self._members}
-        # Starting is work for a core: one at a time on each, so that the first play while others start.
         metrics.ACTORS_WANTED.set(self._count)
+        # Starting is work for a core: one at a time on each, so that the first play while others start.
         self._starting_at_once = max(1, int(ray.cluster_resources().get("CPU", 1)))
 
     def stop(self) -> None:

@@ -120,7 +120,8 @@ class RolloutActor:
             if message.HasField("policy"):
                 self._player.load(codec.decode_policy(message.policy, self._shapes))
                 self._version = message.policy.version
-            for request in gather(map(self._play, map(codec.decode_ticket, message.tickets))):
+            # Not `map`, which takes a StopIteration of a game for its own end and drops the tickets left.
+            for request in gather(self._play(codec.decode_ticket(ticket)) for ticket in message.tickets):
                 outgoing.put(request)
             if message.HasField("drain"):
                 log.info("drained", reason=message.drain.reason)

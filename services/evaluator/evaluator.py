@@ -30,11 +30,12 @@ def evaluate(
     `mode` is "greedy" or "sampled", as `AlgorithmConfig.frozen_choice` has them.
     """
     player.load(weights)
-    base = seeds.episode_seed(config.seed, seeds.EVALUATION, episode)
     exploration, epsilon = config.algorithm.frozen_choice(sampled=mode == "sampled")
     episodes = config.evaluation.episodes
     played = [
-        player.play(Ticket(index, 0, seeds.derive(base, index), exploration, epsilon))
+        player.play(
+            Ticket(index, 0, seeds.evaluation_seed(config.seed, episode, index), exploration, epsilon)
+        )
         for index in range(episodes)
     ]
     metrics.EVALUATION_EPISODES.labels(mode).inc(episodes)

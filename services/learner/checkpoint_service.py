@@ -134,7 +134,7 @@ class CheckpointService(checkpoint_pb2_grpc.CheckpointServiceServicer):
             raise Refused(grpc.StatusCode.UNAVAILABLE, str(error)) from None
         self.evaluations[evaluation.episode] = evaluation
         self._damaged.discard(evaluation.episode)  # its file has been restored
-        metrics.CHECKPOINTS_DAMAGED.set(len(self._damaged))
+        self._show_damage()
         self._show_evaluations()
         await self.changed()
         return checkpoint_pb2.ReportEvaluationResponse(duplicate=False)
@@ -150,9 +150,13 @@ class CheckpointService(checkpoint_pb2_grpc.CheckpointServiceServicer):
 
     async def _note_damage(self, episode: int) -> None:
         self._damaged.add(episode)
-        metrics.CHECKPOINTS_DAMAGED.set(len(self._damaged))
+        self._show_damage()
         log.error("a checkpoint is damaged; it is neither served nor tested", episode=episode)
         await self.changed()
+
+    def _show_damage(self) -> None:
+        """Those that wait for their test in vain; what has had it lacks nothing but its file."""
+        metrics.CHECKPOINTS_DAMAGED.set(len(self._damaged - self.evaluations.keys()))
 
     def _find(self, episode: int) -> Manifest:
         try:

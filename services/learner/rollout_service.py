@@ -13,9 +13,12 @@ import structlog
 from liir_common import metrics
 from liir_common.build import build
 from liir_common.config import Config
+from liir_common.errors import ConfigError
 from liir_common.rpc import codec
+from liir_common.rpc.channel import MAX_MESSAGE_BYTES
 from liir_common.rpc.gen.liir.v1 import rollout_pb2, rollout_pb2_grpc
 from liir_common.rpc.refused import Refused
+from liir_common.rpc.requests import TOGETHER_BYTES
 from liir_common.types import EnvSpec, Weights
 from services.learner.intake import Intake, Opening
 from services.learner.trainer import Batches
@@ -95,7 +98,12 @@ class RolloutService(rollout_pb2_grpc.RolloutServiceServicer):
     """Lives on the event loop; only `publish` may be called from elsewhere, through the loop."""
 
     def __init__(self, config: Config, spec: EnvSpec, first_batch: int, batches: Batches) -> None:
-        """Deliver complete batches, from `first_batch` on, to `batches`."""
+        """Deliver complete batches, from `first_batch` on, to `batches`.
+
+        Raises:
+            ConfigError: an episode could be larger than a message may be.
+        """
+        _check_size(spec)
         self._config = config
         self._spec = spec
         self._intake = Intake(
@@ -247,3 +255,12 @@ class RolloutService(rollout_pb2_grpc.RolloutServiceServicer):
         if tickets:
             metrics.TICKETS_REISSUED.labels(reason).inc(tickets)
             self._assign()
+
+
+def _check_size(spec: EnvSpec) -> None:
+    largest, most = codec.largest_episode(spec), MAX_MESSAGE_BYTES - TOGETHER_BYTES
+    if largest > most:
+        raise ConfigError(
+            f"{spec.name}: wanted episodes of at most {most / 2**20:.0f} MiB, one of {spec.episode_limit} "
+            f"steps would have {largest / 2**20:.0f}; lower its limit of steps, or what it observes"
+        )

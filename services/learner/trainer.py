@@ -21,7 +21,7 @@ from torch import Tensor
 from liir_common import metrics
 from liir_common.build import git_commit
 from liir_common.checkpoint import Manifest, pack
-from liir_common.errors import CorruptError, DiskFullError, storage_explained
+from liir_common.errors import CorruptError, DiskFullError, DivergedError, storage_explained
 from liir_common.rpc.gen.liir.v1 import training_pb2
 from liir_common.types import Batch, Trajectory, Weights
 from services.learner.algorithms import Algorithm
@@ -113,6 +113,7 @@ class Trainer:
         """Train; the state is saved when this returns.
 
         Raises:
+            DivergedError: learning has diverged.
             StorageError: the run directory cannot be written to; while it is only full, this waits for room
                 until told to stop.
         """
@@ -140,7 +141,10 @@ class Trainer:
                 before.env_steps + batch.env_steps,
                 before.episodes + len(trajectories),
             )
-            figures = self.algorithm.update(batch, partial(self._open, after))
+            try:
+                figures = self.algorithm.update(batch, partial(self._open, after))
+            except FloatingPointError as error:
+                raise DivergedError(f"{error}; begin another run with lower learning rates") from None
         progress.counters = after
         with _timed("record"):
             seconds = {"collect_s": collect.seconds, "update_s": update.seconds}

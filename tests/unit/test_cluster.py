@@ -14,7 +14,7 @@ from liir_common.config import PLAINTEXT, SecurityConfig, load
 from liir_common.errors import ConfigError, LiirError
 from liir_common.launch import Request
 from liir_common.rpc import carry
-from liir_common.rpc.tokens import Role, Tokens
+from liir_common.rpc.tokens import VARIABLE, Role, Tokens
 from services.cluster.__main__ import learners_place, roles_security
 
 HEAD = {"CPU": 4.0, "node:10.0.0.1": 1.0, "node:__internal_head__": 1.0}
@@ -62,6 +62,14 @@ def test_a_resumed_run_goes_where_its_directory_is(tmp_path: Path) -> None:
     (tmp_path / "state").mkdir()
     (tmp_path / "state" / "state-000000003.safetensors").touch()
     assert learners_place(resumed, {"10.0.0.1": HEAD})["resources"] == ON_HEAD
+
+
+def test_tokens_of_the_environment_are_carried(monkeypatch: pytest.MonkeyPatch) -> None:
+    line = f"operator {'x' * 32}"
+    monkeypatch.setenv(VARIABLE, line)
+    carried = carry.unpack(carry.pack(SecurityConfig()))
+    monkeypatch.delenv(VARIABLE)
+    assert Tokens(carried.tokens).own(Role.OPERATOR).secret == "x" * 32
 
 
 def test_carried_files_are_in_memory_and_hold_only_the_token_of_the_role(tmp_path: Path) -> None:

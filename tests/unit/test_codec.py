@@ -10,8 +10,8 @@ import zstandard
 from liir_common.rollout import changes
 from liir_common.rpc import codec
 from liir_common.rpc.gen.liir.v1 import rollout_pb2, tensor_pb2
-from liir_common.types import Exploration, Ticket, policy_shapes, trajectories_equal
-from tests.samples import SPEC, encode_sample, make_trajectory
+from liir_common.types import Exploration, Ticket, policy_shapes
+from tests.samples import SPEC, encode_sample, make_trajectory, trajectories_equal
 
 STATS = rollout_pb2.ActorStats(play_seconds=0.5, wait_seconds=0.25)
 

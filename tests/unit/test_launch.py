@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 from pathlib import Path
 
 import pytest
 
-from liir_common.launch import LocalService
+from liir_common.config import PLAINTEXT
+from liir_common.launch import Launcher, LocalService
 from tests.e2e.service import wait_for
 
 PROGRAM = """
@@ -55,6 +57,25 @@ def test_an_obituary_has_code_phase_exception_and_log(tmp_path: Path, last: str,
     for part in parts:
         assert part in text
     assert "incarnation before" not in text
+
+
+class Silent(Program):
+    """A learner that never serves."""
+
+    def address(self) -> None:
+        return None
+
+
+def test_a_signal_before_the_learner_serves_ends_the_start(tmp_path: Path) -> None:
+    learner = Silent("learner", ["import time; time.sleep(60)"], tmp_path)
+    others = [Program(name, ["raise SystemExit"], tmp_path) for name in ("actor", "evaluator")]
+    launcher = Launcher(tmp_path, learner, *others, PLAINTEXT)
+    launcher._on_signal(signal.SIGINT, None)
+    try:
+        assert launcher._start(evaluate=True) is None
+    finally:
+        learner.end()
+    assert [service.exit_code for service in others] == [None, None], "neither was started"
 
 
 def test_what_the_learner_said_of_itself_counts_more_than_its_log(tmp_path: Path) -> None:

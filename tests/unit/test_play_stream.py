@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import queue
+from dataclasses import replace
 
 import pytest
 
+from liir_common import config
+from liir_common.errors import ConfigError
 from liir_common.rpc.gen.liir.v1 import rollout_pb2, tensor_pb2
 from liir_common.rpc.requests import Outgoing, gather, put_together
-from services.learner.rollout_service import ActorStream
+from services.learner.rollout_service import ActorStream, RolloutService
+from tests.samples import SPEC
 
 
 def sent(stream: ActorStream) -> list[rollout_pb2.PlayResponse]:
@@ -91,3 +95,9 @@ def test_what_is_played_in_one_go_is_gathered_up_to_a_size() -> None:
     assert [t.episode_id for t in next(requests).trajectories] == [1, 2]
     assert next(played).trajectories[0].episode_id == 3
     assert list(requests) == []
+
+
+def test_a_game_whose_episodes_no_message_can_hold_is_refused() -> None:
+    big = replace(SPEC, obs_dim=84 * 84 * 4, n_agents=8, episode_limit=60)
+    with pytest.raises(ConfigError, match="at most 31 MiB, one of 60 steps would have 53"):
+        RolloutService(config.load(None), big, 0, queue.SimpleQueue())

@@ -31,8 +31,9 @@ from liir_common.replay.page import page_data, write_page
 from liir_common.replay.record import Recording, record, target_number
 from liir_common.replay.write import write
 from liir_common.rollout.fused import FusedPlayer
-from liir_common.types import Exploration, Ticket, trajectories_equal
+from liir_common.types import Exploration, Ticket
 from tests.replays import BOUND, HIDDEN, publish
+from tests.samples import trajectories_equal
 
 OPTIONS = {"reward_only_positive": True, "state_last_action": False}
 SAMPLED = Exploration.SOFTMAX_FLOOR

@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from liir_common import config
+from liir_common import config, results
+from liir_common.errors import ConfigError
 from liir_common.files import Table, read_table
 from liir_common.report import curve_labels, summarise, write_report, write_results
 
@@ -26,6 +27,13 @@ def make_run(path: Path, greedy: list[float]) -> Path:
             }
         )
     return path
+
+
+def make_result(path: Path, *settings: str, rates: list[float]) -> Path:
+    run = make_run(path, rates)
+    (run / "config.yaml").write_text(yaml.safe_dump(config.load(None, settings).tree()))
+    (run / "run.json").write_text(json.dumps({"git": "abc"}))
+    return run
 
 
 def test_levels_want_one_and_three_in_a_row(tmp_path: Path) -> None:
@@ -59,12 +67,8 @@ def test_the_curve_is_a_picture(tmp_path: Path) -> None:
 
 
 def test_results_gather_runs_by_method(tmp_path: Path) -> None:
-    runs = []
-    for name, settings in (("a", []), ("b", ["algorithm.lambda=0"]), ("c", ["algorithm.name=central_v"])):
-        run = make_run(tmp_path / name, [0.5, 1.0])
-        (run / "config.yaml").write_text(yaml.safe_dump(config.load(None, settings).tree()))
-        (run / "run.json").write_text(json.dumps({"git": "abc"}))
-        runs.append(run)
+    methods = {"a": [], "b": ["algorithm.lambda=0"], "c": ["algorithm.name=central_v"]}
+    runs = [make_result(tmp_path / name, *settings, rates=[0.5, 1.0]) for name, settings in methods.items()]
     write_results(runs, tmp_path / "results")
     rows = read_table(tmp_path / "results" / "runs.csv")
     assert [row["method"] for row in rows] == ["liir", "liir, λ = 0", "central_v"]
@@ -72,6 +76,26 @@ def test_results_gather_runs_by_method(tmp_path: Path) -> None:
     assert len(read_table(tmp_path / "results" / "curves.csv")) == 6
     assert config.load(tmp_path / "results" / "b.yaml", ["preset=none"]).algorithm.lambda_ == 0
     assert (tmp_path / "results" / "winrate.png").exists()
+
+
+def test_results_of_runs_without_a_test_are_a_header(tmp_path: Path) -> None:
+    run = make_result(tmp_path / "a", "evaluation.enabled=false", rates=[])
+    write_results([run], tmp_path / "results")
+    text = (tmp_path / "results" / "curves.csv").read_text()
+    assert text == "run,episode,env_steps,greedy_win_rate,sampled_win_rate\n"
+
+
+def test_runs_of_one_name_are_refused(tmp_path: Path) -> None:
+    runs = [make_result(tmp_path / sweep / "3m-liir-seed1", rates=[0.5]) for sweep in "ab"]
+    with pytest.raises(ConfigError, match="3m-liir-seed1 more than once"):
+        write_results(runs, tmp_path / "results")
+
+
+def test_a_map_is_named_with_the_game_that_it_is_of(tmp_path: Path) -> None:
+    runs = [make_result(tmp_path / kind, f"env.kind={kind}", rates=[0.5]) for kind in ("battle", "smac")]
+    write_results(runs, tmp_path / "results")
+    assert [row["map"] for row in read_table(tmp_path / "results" / "runs.csv")] == ["3m", "smac-3m"]
+    assert {row["map"] for row in results.rows(runs[1])} == {"smac-3m"}
 
 
 def test_curves_of_one_method_are_named_by_the_settings_that_differ() -> None:

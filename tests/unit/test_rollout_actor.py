@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import queue
 from collections.abc import Iterator
 from concurrent import futures
 from itertools import repeat
@@ -44,6 +45,14 @@ def play(ends: str, monkeypatch: pytest.MonkeyPatch) -> str:
     finally:
         server.stop(0).wait()
     return "".join(learner.ends)
+
+
+def test_a_stop_iteration_of_a_game_is_an_error_and_drops_no_tickets(monkeypatch: pytest.MonkeyPatch) -> None:
+    actor = RolloutActor("a", 1, "127.0.0.1:1", Config().tree(), {})
+    monkeypatch.setattr(actor, "_play", lambda ticket: next(iter(())))
+    message = rollout_pb2.PlayResponse(tickets=[rollout_pb2.Ticket(exploration=1)])
+    with pytest.raises(RuntimeError, match="StopIteration"):
+        actor._answer([message], queue.SimpleQueue())
 
 
 def test_a_refusal_is_an_accident_and_three_in_a_row_are_a_fault(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -27,8 +27,8 @@ from liir_common.types import (
     Trajectory,
     Weights,
     expected_shape,
-    trajectories_equal,
 )
+from tests.samples import trajectories_equal
 from tests.unit.test_rollout_policy import TorchPolicy
 
 HIDDEN = 64

@@ -257,6 +257,13 @@ def test_a_game_without_a_limit_is_refused() -> None:
     assert loop_spec(game, "pursuit", {}).episode_limit == 11
 
 
+def test_a_figure_called_like_one_of_every_episode_is_refused() -> None:
+    game = parallel_env()
+    game.info_keys = ("return", "won")  # type: ignore[attr-defined]
+    with pytest.raises(ValueError, match="info_keys: return is what every episode has"):
+        loop_spec(game, "pursuit", {})
+
+
 def test_playing_wants_weights_and_a_possible_ticket() -> None:
     game = parallel_env()
     player = LoopPlayer(game, loop_spec(game, "pursuit", {}), HIDDEN)

@@ -12,7 +12,8 @@ from liir_common.rollout.fused import FusedPlayer
 from liir_common.rollout.loop import LoopPlayer
 from liir_common.rollout.play import env_spec, make_player, warm_up
 from liir_common.rollout.policy import random_weights
-from liir_common.types import Exploration, Ticket, trajectories_equal
+from liir_common.types import Exploration, Ticket
+from tests.samples import trajectories_equal
 
 PURSUIT = EnvConfig(kind="pettingzoo", factory="liir_common.pursuit:parallel_env", options={"horizon": 9})
 

@@ -12,6 +12,7 @@ import pytest
 
 from liir_common import metrics
 from liir_common.config import PLAINTEXT
+from liir_common.rpc import server
 from liir_common.rpc.refused import Refused
 from liir_common.rpc.server import Server
 
@@ -72,3 +73,17 @@ def test_whatever_a_handler_raises_but_cancellation_is_counted(name: str, code: 
         assert after == before
     else:
         assert (ended, after) == (code, before | {code: before.get(code, 0) + 1})
+
+
+@pytest.mark.parametrize(
+    ("host", "name", "loopback"),
+    [
+        ("::1", "[::1]", True),
+        ("[::1]", "[::1]", True),
+        ("127.0.0.1", "127.0.0.1", True),
+        ("::", "[::]", False),
+    ],
+)
+def test_addresses_of_ipv6_are_in_brackets(host: str, name: str, loopback: bool) -> None:
+    assert server._bracketed(host) == name
+    assert server._is_loopback(host) == loopback

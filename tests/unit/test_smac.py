@@ -20,7 +20,8 @@ from liir_common.rollout.loop import LoopPlayer
 from liir_common.rollout.play import env_spec, make_player
 from liir_common.rollout.policy import random_weights
 from liir_common.smac import SmacEnv
-from liir_common.types import Exploration, Ticket, trajectories_equal
+from liir_common.types import Exploration, Ticket
+from tests.samples import trajectories_equal
 
 STAND_IN = str(Path(__file__).parents[1] / "stand_in")
 OPTIONS: dict[str, Any] = {"reward_only_positive": False, "state_last_action": False}

@@ -158,3 +158,20 @@ def test_a_run_of_an_older_build_is_compared_with_the_defaults_of_what_it_did_no
     del tree["algorithm"]["ratio_bound"]
     (folder / "config.yaml").write_text(yaml.safe_dump(tree))
     Sweep(plan(sweep, ["liir"], ["3m"], [1]), tmp_path / "out")
+
+
+def test_a_run_gets_tokens_and_no_settings_from_the_environment(
+    sweep: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given: list[dict[str, str]] = []
+
+    def popen(command: list[str], env: dict[str, str], **_: object) -> object:
+        given.append(env)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("liir_common.sweep.subprocess.Popen", popen)
+    monkeypatch.setenv("LIIR_TOKENS", "reader secret")
+    monkeypatch.setenv("LIIR_SEED", "3")
+    with pytest.raises(KeyboardInterrupt):
+        Sweep(plan(sweep), tmp_path / "out")._begin(plan(sweep)[0])
+    assert {name for name in given[0] if name.startswith("LIIR_")} == {"LIIR_TOKENS"}

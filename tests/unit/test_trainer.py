@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from liir_common import config, metrics
-from liir_common.errors import CorruptError
-from liir_common.types import Weights
+from liir_common import config, launch, metrics
+from liir_common.errors import CorruptError, DivergedError
+from liir_common.types import Batch, Weights
 from services.learner.algorithms import make_algorithm
 from services.learner.intake import Opening
 from services.learner.run_directory import RunDirectory
@@ -124,6 +124,22 @@ def test_a_crash_costs_the_steps_since_the_last_save_and_changes_nothing(
     assert resumed.trainer.next_batch == 4
     assert len(resumed.run.metrics.read()) == 4
     assert resumed.train().digests() == whole.digests()
+
+
+def test_learning_that_diverged_is_an_error_that_nobody_tries_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    played = Played(tmp_path, 3)
+
+    def diverge(batch: Batch, policy_ready: object) -> dict[str, float]:
+        raise FloatingPointError("learning has diverged, not finite: {'value_loss': nan}")
+
+    monkeypatch.setattr(played.trainer.algorithm, "update", diverge)
+    with pytest.raises(
+        DivergedError, match=r"value_loss.*begin another run with lower learning rates"
+    ) as raised:
+        played.train()
+    assert raised.value.exit_code in launch._IN_VAIN
 
 
 def test_stop_ends_a_trainer_that_waits(tmp_path: Path) -> None:

@@ -16,8 +16,8 @@ from liir_common.types import (
     Trajectory,
     expected_shape,
     policy_shapes,
-    trajectories_equal,
 )
+from tests.samples import trajectories_equal
 
 SPEC = EnvSpec("battle/3m", "1", "{}", 3, 9, 30, 48, 60, ("won",))
 

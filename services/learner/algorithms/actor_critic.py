@@ -83,9 +83,7 @@ class ActorCritic:
             FloatingPointError: nobody could play with it.
         """
         if not torch.isfinite(self._policy.theta).all():
-            raise FloatingPointError(
-                "learning has diverged: the policy is not finite; lower the learning rates"
-            )
+            raise FloatingPointError("learning has diverged: the policy is not finite")
         policy_ready()
 
     def _return(self, data: Data, reward: Tensor, value: Tensor) -> Tensor:

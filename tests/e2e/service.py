@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 import time
+import urllib.request
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,6 +23,7 @@ from liir_common.config import Config, load
 LIIR = str(Path(sys.executable).with_name("liir"))
 TIMEOUT_S = 180.0
 SMALL = (
+    "seed=7",
     "actors.count=2",
     "training.batch_episodes=8",
     "training.total_env_steps=6000",
@@ -33,7 +35,10 @@ SMALL = (
     "actors.metrics_port=0",
     "evaluation.metrics_port=0",
 )
-"""A run of some thirty learner steps, about ten seconds with the start."""
+"""A run of some thirty learner steps, about ten seconds with the start.
+
+Its seed is not the default, so that a process which takes another one is noticed.
+"""
 
 
 def arguments(settings: Sequence[str]) -> list[str]:
@@ -105,6 +110,13 @@ def learner_step(run_dir: Path) -> int:
 def endpoints(run_dir: Path) -> dict[str, str]:
     """Where the learner of a run listens."""
     return json.loads((run_dir / "endpoints.json").read_text())  # type: ignore[no-any-return]
+
+
+def samples(url: str) -> dict[str, float]:
+    """Samples of a /metrics page, by name with labels."""
+    page = urllib.request.urlopen(url, timeout=30).read().decode()
+    lines = [line.rpartition(" ") for line in page.splitlines() if not line.startswith("#")]
+    return {name: float(value) for name, _, value in lines}
 
 
 def descendants(process: subprocess.Popen[str], command: str) -> list[psutil.Process]:

@@ -8,7 +8,6 @@ import os
 import re
 import socket
 import threading
-import time
 from collections.abc import AsyncIterator, Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
@@ -31,6 +30,7 @@ from liir_common.rpc.gen.liir.v1 import checkpoint_pb2_grpc
 from liir_common.rpc.server import Server
 from services.learner.checkpoint_service import CheckpointService
 from services.learner.run_directory import RunDirectory
+from tests.e2e.service import wait_for
 
 API = Path(__file__).parents[2] / "docs" / "api.md"
 HIDDEN = 96
@@ -112,20 +112,26 @@ def store(tmp_path: Path) -> Store:
     return Store(tmp_path / "run")
 
 
-_TIME_TO_READ_S = 0.5
-
-
 @contextmanager
-def cutting(address: str, limit: int, connections: int) -> Iterator[str]:
-    """A way to `address` that hangs up after `limit` bytes of answers, and for good after `connections`."""
+def cutting(address: str, part: Path, limit: int, connections: int) -> Iterator[str]:
+    """A way to `address` that hangs up after `limit` bytes of answers, and for good after `connections`.
+
+    Every connection that is cut has made the file `part` longer: gRPC drops what a client has not asked for
+    yet when the connection goes, so it is held until then.
+    """
     host, port = address.split(":")
     listener = socket.create_server(("127.0.0.1", 0))
 
     def relay(client: socket.socket) -> None:
+        begun = size(part)
+
+        def hold() -> None:
+            wait_for(lambda: size(part) > begun, "the arrival of a chunk")
+
         with client, socket.create_connection((host, int(port))) as server:
             back = threading.Thread(target=pump, args=(client, server), daemon=True)
             back.start()
-            pump(server, client, limit)
+            pump(server, client, limit, hold)
             back.join()
 
     def accept() -> None:
@@ -142,11 +148,19 @@ def cutting(address: str, limit: int, connections: int) -> Iterator[str]:
         listener.close()
 
 
-def pump(source: socket.socket, sink: socket.socket, limit: float = float("inf")) -> None:
-    """Pass on what comes until its end or `limit` bytes; then hang up on `sink`, and throw away the rest.
+def size(path: Path) -> int:
+    return path.stat().st_size if path.exists() else 0
 
-    A socket closed before all is read would make the other end throw away what it has received, and gRPC
-    drops what a client has not asked for yet when the connection goes: it gets the time to ask.
+
+def pump(
+    source: socket.socket,
+    sink: socket.socket,
+    limit: float = float("inf"),
+    hold: Callable[[], None] = lambda: None,
+) -> None:
+    """Pass on what comes until its end or `limit` bytes; then `hold`, hang up on `sink`, and drop the rest.
+
+    A socket closed before all is read would make the other end throw away what it has received.
     """
     passed = 0
     with suppress(OSError):
@@ -154,7 +168,7 @@ def pump(source: socket.socket, sink: socket.socket, limit: float = float("inf")
             sink.sendall(data)
             passed += len(data)
     if passed >= limit:
-        time.sleep(_TIME_TO_READ_S)
+        hold()
     with suppress(OSError):
         sink.shutdown(socket.SHUT_WR)
     with suppress(OSError):
@@ -167,7 +181,8 @@ def files(folder: Path) -> list[str]:
 
 
 def test_a_download_goes_on_where_it_broke(store: Store, tmp_path: Path) -> None:
-    with store.served() as address, cutting(address, limit=CHUNK + 20_000, connections=99) as shaky:
+    part = tmp_path / "got" / f".{store.manifest.sha256}.part"
+    with store.served() as address, cutting(address, part, limit=CHUNK + 20_000, connections=99) as shaky:
         with CheckpointClient(shaky) as client:
             path = client.save(100, tmp_path / "got")
         assert path.read_bytes() == store.data
@@ -180,22 +195,22 @@ def test_a_download_goes_on_where_it_broke(store: Store, tmp_path: Path) -> None
 
 
 def test_another_process_goes_on_where_the_last_one_was_cut(store: Store, tmp_path: Path) -> None:
-    part = f".{store.manifest.sha256}.part"
+    part = tmp_path / "got" / f".{store.manifest.sha256}.part"
     with store.served() as address:
         with (
-            cutting(address, limit=len(store.data) // 2, connections=1) as shaky,
+            cutting(address, part, limit=len(store.data) // 2, connections=1) as shaky,
             CheckpointClient(shaky) as client,
             pytest.raises(UnreachableError, match="the download broke 5 times"),
         ):
             client.save(100, tmp_path / "got")
-        assert files(tmp_path / "got") == [part], "nothing that looks like a checkpoint"
-        begun = (tmp_path / "got" / part).stat().st_size
+        assert files(part.parent) == [part.name], "nothing that looks like a checkpoint"
+        begun = size(part)
         assert 0 < begun < len(store.data)
         with CheckpointClient(address) as client:
             path = client.save(100, tmp_path / "got")
     assert store.service.offsets[-1] == begun
     assert path.read_bytes() == store.data
-    assert part not in files(tmp_path / "got")
+    assert not part.exists()
 
 
 def test_a_damaged_part_is_thrown_away(store: Store, tmp_path: Path) -> None:

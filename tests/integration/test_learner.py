@@ -17,6 +17,7 @@ from typing import Any
 import grpc
 import numpy as np
 import pytest
+import torch
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha.proto_reflection_descriptor_database import ProtoReflectionDescriptorDatabase
 from typer.testing import CliRunner
@@ -24,16 +25,21 @@ from typer.testing import CliRunner
 from liir_common import checkpoint, seeds
 from liir_common.build import build
 from liir_common.cli import app
-from liir_common.client import CheckpointClient, TrainingClient
+from liir_common.client import CheckpointClient, TrainingClient, learners_config
+from liir_common.config import PLAINTEXT
 from liir_common.errors import ConfigError, LiirError, MissingError, RefusedError, UnreachableError
+from liir_common.files import read_table
 from liir_common.policy import Policy
 from liir_common.replay.load import find_checkpoint
 from liir_common.rollout.play import make_player
+from liir_common.rollout.player import Player
 from liir_common.rpc import codec
 from liir_common.rpc.channel import CHANNEL_OPTIONS, connect
 from liir_common.rpc.gen.liir.v1 import checkpoint_pb2, rollout_pb2, rollout_pb2_grpc
-from liir_common.types import Ticket, policy_shapes
+from liir_common.rpc.tokens import Role
+from liir_common.types import Exploration, Ticket, Trajectory, Weights, policy_shapes
 from services.evaluator.evaluator import Evaluator
+from services.learner.algorithms import make_algorithm
 from tests.e2e import service
 from tests.faults.proxy import Proxy
 from tests.grpcurl import grpcurl, needs_grpcurl
@@ -45,8 +51,8 @@ PLAYER = service.config("env.map=3m")
 class Actor:
     """Speaks one stream, a message at a time."""
 
-    def __init__(self, address: str, **hello: object) -> None:
-        self.player = make_player(PLAYER.env)
+    def __init__(self, address: str, player: Player | None = None, **hello: object) -> None:
+        self.player = player or make_player(PLAYER.env)
         self._channel = grpc.insecure_channel(address, options=CHANNEL_OPTIONS)
         self._outgoing: queue.SimpleQueue[rollout_pb2.PlayRequest | None] = queue.SimpleQueue()
         fields = {"actor_id": "test", "env_spec_hash": self.player.spec.hash, "build": build()} | hello
@@ -108,6 +114,23 @@ class Actor:
         return caught.value
 
 
+class Recorder:
+    """A real player that remembers what it played."""
+
+    def __init__(self) -> None:
+        self.player = make_player(PLAYER.env)
+        self.spec = self.player.spec
+        self.played: list[tuple[Ticket, Trajectory]] = []
+
+    def load(self, weights: Weights) -> None:
+        self.player.load(weights)
+
+    def play(self, ticket: Ticket) -> Trajectory:
+        trajectory = self.player.play(codec.decode_ticket(codec.encode_ticket(ticket)))
+        self.played.append((ticket, trajectory))
+        return trajectory
+
+
 @pytest.fixture
 def learner(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[tuple[str, Path]]:
     """Address and run directory of a learner whose batches have four episodes; more settings as parameter."""
@@ -147,7 +170,9 @@ def test_play_stream(learner: tuple[str, Path]) -> None:
     address, _ = learner
     with Actor(address) as actor, TrainingClient(address) as training:
         actor.ask(3)
-        assert actor.receive().policy.version == 0
+        policy = actor.receive().policy
+        assert policy.version == 0
+        assert_begins_from_seed(policy)
         tickets = [actor.order() for _ in range(3)]
         assert [ticket.episode_id for ticket in tickets] == [0, 1, 2]
         assert tickets[2].seed == seeds.episode_seed(PLAYER.seed, seeds.TRAINING, 2)
@@ -162,6 +187,17 @@ def test_play_stream(learner: tuple[str, Path]) -> None:
         # Tickets of the next batch come while the step that moved the policy is still being made.
         service.wait_for(lambda: training.status().learner_step == 1, "the end of the step")
         assert training.status().episodes == 4
+
+
+def assert_begins_from_seed(policy: rollout_pb2.Policy) -> None:
+    """The policy of version 0 is what the run's seed makes of the method."""
+    spec = make_player(PLAYER.env).spec
+    seed = seeds.derive(PLAYER.seed, seeds.LEARNER)
+    wanted = make_algorithm(spec, PLAYER.algorithm, seed, torch.device("cpu")).policy()
+    got = codec.decode_policy(policy, policy_shapes(spec, 64))
+    for name, array in wanted.items():
+        # The learner makes them with another number of threads, which may round otherwise.
+        np.testing.assert_allclose(got[name], array, rtol=0, atol=1e-5, err_msg=name)
 
 
 def test_tickets_of_a_broken_stream_go_to_the_next_actor(learner: tuple[str, Path]) -> None:
@@ -318,11 +354,19 @@ def test_checkpoints_are_listed_watched_and_fetched(learner: tuple[str, Path], t
 def evaluation_of(
     frozen: checkpoint_pb2.Checkpoint, wins: int = 0, return_mean: float = 0.0
 ) -> checkpoint_pb2.Evaluation:
-    means = {"won": wins / 4, "dead_allies": 1.0, "dead_enemies": 2.0}
-    stats = checkpoint_pb2.EpisodeStats(episodes=4, wins=wins, return_mean=return_mean, info_means=means)
+    """The sampled episodes have one win less, where there is one, and half the return."""
     return checkpoint_pb2.Evaluation(
-        episode=frozen.episode, sha256=frozen.sha256, env_steps=frozen.env_steps, greedy=stats, sampled=stats
+        episode=frozen.episode,
+        sha256=frozen.sha256,
+        env_steps=frozen.env_steps,
+        greedy=stats_of(wins, return_mean),
+        sampled=stats_of(max(0, wins - 1), return_mean / 2),
     )
+
+
+def stats_of(wins: int, return_mean: float) -> checkpoint_pb2.EpisodeStats:
+    means = {"won": wins / 4, "dead_allies": 1.0, "dead_enemies": 2.0}
+    return checkpoint_pb2.EpisodeStats(episodes=4, wins=wins, return_mean=return_mean, info_means=means)
 
 
 def test_evaluations_are_stored_once(learner: tuple[str, Path]) -> None:
@@ -362,12 +406,13 @@ def test_the_commands_list_watch_rank_and_fetch(learner: tuple[str, Path], tmp_p
         best = client.best()
         sha256_of = {frozen.episode: frozen.sha256 for frozen in client.list()}
     assert best.episode == 12
+    assert_newest_test_is_shown(run_dir, greedy=(0.5, 20.0), sampled=(0.25, 10.0))
     assert find_checkpoint(None, run_dir, best=True).stem == "checkpoint-000000012"
     rows = [line.split() for line in checkpoints("list", "--map", "3m")]
     assert {int(row[0]): row[4] for row in rows} == sha256_of
     line, path = checkpoints("best", "--map", "3m", "-o", str(tmp_path / "best"))
     assert line.split()[0] == "12"
-    assert line.endswith("won greedy 3/4, sampled 3/4; return 10.00")
+    assert line.endswith("won greedy 3/4, sampled 2/4; return 10.00")
     (fetched,) = checkpoints("get", "12", "-o", str(tmp_path / "got"))
     for file in (Path(path), Path(fetched)):
         assert sha256(file.read_bytes()).hexdigest() == sha256_of[12]
@@ -377,6 +422,15 @@ def test_the_commands_list_watch_rank_and_fetch(learner: tuple[str, Path], tmp_p
         checkpoints("list", "--map", "8m")
     with pytest.raises(LiirError, match="no checkpoint of episode 7"):
         checkpoints("get", "7", "-o", str(tmp_path))
+
+
+def assert_newest_test_is_shown(run_dir: Path, **wanted: tuple[float, float]) -> None:
+    """Win rate and mean return among the learner's metrics, by how the actions were chosen."""
+    shown = service.samples(f"http://{service.endpoints(run_dir)['metrics']}/metrics")
+    for actions, (win_rate, return_mean) in wanted.items():
+        labels = f'{{actions="{actions}",map="3m"}}'
+        assert shown[f"liir_win_rate{labels}"] == win_rate
+        assert shown[f"liir_evaluation_return{labels}"] == return_mean
 
 
 @needs_grpcurl
@@ -475,6 +529,8 @@ def test_a_learner_that_ends_lets_nobody_in_and_cuts_nobody_off(tmp_path: Path) 
     service.wait_for((run_dir / "endpoints.json").exists, "the learner's start")
     address = service.endpoints(run_dir)["address"]
     play_batches(address, 1)
+    # The learner waits a few seconds for an actor that leaves, and a player may take longer to make.
+    player = make_player(PLAYER.env)
     with Actor(address) as slow, CheckpointClient(address) as client, TrainingClient(address) as training:
         slow.ask()
         slow.order()
@@ -485,7 +541,7 @@ def test_a_learner_that_ends_lets_nobody_in_and_cuts_nobody_off(tmp_path: Path) 
         assert response.HasField("drain")
         assert not response.drain.run_complete
         slow.ask()
-        with Actor(address) as newcomer:
+        with Actor(address, player) as newcomer:
             newcomer.ask()
             error = newcomer.error()
         assert error.code() == grpc.StatusCode.UNAVAILABLE
@@ -498,6 +554,28 @@ def test_a_learner_that_ends_lets_nobody_in_and_cuts_nobody_off(tmp_path: Path) 
         assert caught.value.code() == grpc.StatusCode.UNAVAILABLE
         assert "before the run is complete" in str(caught.value.details())
     assert "Traceback" not in service.finish(process)
+
+
+def test_the_evaluator_tests_what_has_no_test_and_ends_with_the_run(tmp_path: Path) -> None:
+    """The run's only batch freezes two checkpoints; the first is tested by somebody else."""
+    run_dir = tmp_path / "run"
+    settings = ("training.batch_episodes=4", "training.checkpoint_interval=2", "training.total_env_steps=1")
+    process = service.start("learner", "--run-dir", str(run_dir), *service.arguments(settings))
+    service.wait_for((run_dir / "endpoints.json").exists, "the learner's start")
+    address = service.endpoints(run_dir)["address"]
+    play_batches(address, 1)
+    with CheckpointClient(address) as client:
+        assert client.report(evaluation_of(next(client.watch()), wins=3))
+    recorder = Recorder()
+    Evaluator(address, learners_config(address, (), PLAINTEXT, Role.EVALUATOR), recorder).run()
+    service.finish(process)
+    others, own = read_table(run_dir / "evaluations.csv")
+    assert (others["episode"], others["greedy_wins"], own["episode"]) == ("2", "3", "4")
+    assert len(recorder.played) == 2 * PLAYER.evaluation.episodes
+    assert own["greedy_length_mean"] != own["sampled_length_mean"], "else one may pass for the other"
+    for mode, exploration in (("greedy", Exploration.GREEDY), ("sampled", Exploration.SOFTMAX_FLOOR)):
+        lengths = [played.length for ticket, played in recorder.played if ticket.exploration == exploration]
+        assert float(own[f"{mode}_length_mean"]) == np.mean(lengths)
 
 
 def test_a_run_has_one_learner_at_a_time(learner: tuple[str, Path]) -> None:
@@ -518,6 +596,14 @@ def test_a_busy_port_is_an_error_that_says_what_to_do(tmp_path: Path) -> None:
             settings = service.arguments([f"{key}={port}"])
             process = service.start("learner", "--run-dir", str(tmp_path / key), *settings)
             assert advice in service.finish(process, code=2)
+
+
+def test_an_evaluators_busy_metrics_port_is_an_error_that_names_its_key(learner: tuple[str, Path]) -> None:
+    address, _ = learner
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        setting = f"evaluation.metrics_port={taken.getsockname()[1]}"
+        process = service.start("evaluator", "--learner", address, "--set", setting)
+        assert "--set evaluation.metrics_port=N" in service.finish(process, code=2)
 
 
 def test_an_open_address_is_refused_unless_asked_for(tmp_path: Path) -> None:

@@ -7,18 +7,20 @@ import json
 import threading
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from liir_common import checkpoint
+from liir_common import checkpoint, seeds
+from liir_common.battle.engine import EAST, WEST
+from liir_common.battle.tables import FIRST_ATTACK
 from liir_common.client import TrainingClient
 from liir_common.rollout.play import make_player
-from liir_common.rpc import codec
-from liir_common.types import Exploration, Ticket, Trajectory, policy_shapes
+from liir_common.types import EnvSpec, Exploration, Weights, policy_shapes
 from services.evaluator.evaluator import evaluate
 from services.learner.run_directory import RunDirectory
 from services.learner.service import serve
 from tests.e2e import service
-from tests.integration.test_learner import Actor
+from tests.integration.test_learner import Actor, Recorder
 
 STEPS, BATCH = 6, 4
 SETTINGS = (
@@ -80,21 +82,6 @@ def test_stopped_and_resumed_is_never_stopped(tmp_path: Path, method: str) -> No
     assert record["parameters"]["theta"] == 28297
 
 
-class Recorder:
-    """A real player that remembers its tickets."""
-
-    def __init__(self) -> None:
-        self.player = make_player(service.config().env)
-        self.tickets: list[Ticket] = []
-
-    def load(self, weights: dict[str, object]) -> None:
-        self.player.load(weights)
-
-    def play(self, ticket: Ticket) -> Trajectory:
-        self.tickets.append(ticket)
-        return self.player.play(codec.decode_ticket(codec.encode_ticket(ticket)))
-
-
 @pytest.mark.parametrize(
     ("method", "exploration", "epsilon"),
     [("coma", Exploration.SOFTMAX_FLOOR, 0.0), ("qmix", Exploration.EPSILON_GREEDY, 0.05)],
@@ -110,7 +97,43 @@ def test_checkpoints_are_tested_as_their_method_plays(
     config = service.config(f"algorithm={method}")
     for mode in ("greedy", "sampled"):
         assert evaluate(recorder, weights, config, 4, mode).episodes == config.evaluation.episodes
-    half = len(recorder.tickets) // 2
-    assert {(t.exploration, t.epsilon) for t in recorder.tickets[:half]} == {(Exploration.GREEDY, 0.0)}
-    assert {(t.exploration, t.epsilon) for t in recorder.tickets[half:]} == {(exploration, epsilon)}
+    chosen = [(ticket.exploration, ticket.epsilon) for ticket, _ in recorder.played]
+    half = len(chosen) // 2
+    assert set(chosen[:half]) == {(Exploration.GREEDY, 0.0)}
+    assert set(chosen[half:]) == {(exploration, epsilon)}
     assert policy_shapes(run.spec, 64).keys() == weights.keys()
+
+
+def shooting(spec: EnvSpec, otherwise: int) -> Weights:
+    """A policy that shoots at what is in range, and else walks in one direction."""
+    weights = {name: np.zeros(shape, np.float32) for name, shape in policy_shapes(spec, 64).items()}
+    weights["fc2.bias"][FIRST_ATTACK:] = 6.0
+    weights["fc2.bias"][otherwise] = 3.0
+    return weights
+
+
+@pytest.mark.parametrize(("mode", "otherwise"), [("greedy", EAST), ("sampled", WEST)])
+def test_an_evaluation_says_what_was_played(mode: str, otherwise: int) -> None:
+    """Both policies win some of their battles and lose others."""
+    recorder, config = Recorder(), service.config("evaluation.episodes=50")
+    stats = evaluate(recorder, shooting(recorder.spec, otherwise), config, 4, mode)
+    played = [trajectory for _, trajectory in recorder.played]
+    assert stats.episodes == len(played) == 50
+    assert stats.wins == [trajectory.info["won"] for trajectory in played].count(1.0)
+    assert 0 < stats.wins < 50
+    assert stats.return_mean == pytest.approx(sum(float(t.reward.sum()) for t in played) / 50)
+    assert stats.length_mean == sum(t.length for t in played) / 50
+    for key, mean in stats.info_means.items():
+        assert mean == pytest.approx(sum(t.info[key] for t in played) / 50)
+    assert stats.info_means.keys() == set(recorder.spec.info_keys)
+
+
+def test_no_two_test_episodes_of_any_run_have_the_same_seed() -> None:
+    recorder = Recorder()
+    for seed in (7, 8):
+        config = service.config(f"seed={seed}", "evaluation.episodes=20")
+        for episode in (100, 200):
+            evaluate(recorder, shooting(recorder.spec, EAST), config, episode, "greedy")
+    tested = {ticket.seed for ticket, _ in recorder.played}
+    assert len(tested) == len(recorder.played) == 2 * 2 * 20
+    assert tested.isdisjoint(seeds.episode_seed(7, seeds.TRAINING, episode) for episode in range(1000))

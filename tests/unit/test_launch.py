@@ -1,15 +1,26 @@
-"""What the launcher says of a process that died."""
+"""What the launcher says of a process that died, and when it starts one again."""
 
 from __future__ import annotations
 
 import signal
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
+from liir_common import launch
 from liir_common.config import PLAINTEXT
-from liir_common.launch import Launcher, LocalService
+from liir_common.errors import (
+    ConfigError,
+    CorruptError,
+    DivergedError,
+    LiirError,
+    RefusedError,
+    StorageError,
+    UnreachableError,
+)
+from liir_common.launch import Launcher, LocalService, Service
 from tests.e2e.service import wait_for
 
 PROGRAM = """
@@ -84,3 +95,96 @@ def test_what_the_learner_said_of_itself_counts_more_than_its_log(tmp_path: Path
     service.log_path.touch()
     service.phase = "learner updates"
     assert "in the phase 'learner updates'" in service.obituary()
+
+
+class Mortal(Service):
+    """A process of the run that ends when the test says so."""
+
+    exit_code: int | None = None
+    starts = 0
+
+    def start(self) -> None:
+        self.exit_code = None
+        self.starts += 1
+
+    def address(self) -> str | None:
+        return None
+
+    def end(self) -> None:
+        pass
+
+    def last_words(self) -> str:
+        return ""
+
+
+class Watched:
+    """A launcher that watches three processes, by a clock that the test sets."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, path: Path) -> None:
+        self.learner = Mortal("learner", [], path)
+        self.actors = Mortal("actor", [], path)
+        self.evaluator = Mortal("evaluator", [], path)
+        self._launcher = Launcher(path, self.learner, self.actors, self.evaluator, PLAINTEXT)
+        self._now = Mock(return_value=1000.0)
+        monkeypatch.setattr(launch, "time", Mock(monotonic=self._now))
+
+    def look(self, after_s: float) -> None:
+        """Let time pass, then look after the processes as the launcher does while it watches."""
+        self._now.return_value += after_s
+        self._launcher._revive()
+
+    def die(self, code: int, after_s: float = 1.0) -> None:
+        """The evaluator ends with that code."""
+        self.evaluator.exit_code = code
+        self.look(after_s)
+
+
+@pytest.fixture
+def watched(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Watched:
+    return Watched(monkeypatch, tmp_path)
+
+
+@pytest.mark.parametrize("kind", [ConfigError, CorruptError, RefusedError, StorageError, DivergedError])
+def test_what_would_only_end_in_the_same_way_is_not_started_again(
+    watched: Watched, kind: type[LiirError]
+) -> None:
+    with pytest.raises(LiirError, match="the evaluator ended with") as caught:
+        watched.die(kind.exit_code)
+    assert caught.value.exit_code == kind.exit_code
+    assert watched.evaluator.starts == 0
+
+
+@pytest.mark.parametrize("code", [1, -9])
+def test_the_fourth_death_within_five_minutes_is_the_last(watched: Watched, code: int) -> None:
+    for _ in range(3):
+        watched.die(code, after_s=99.0)
+    assert watched.evaluator.starts == 3
+    with pytest.raises(LiirError, match="the evaluator ended with") as caught:
+        watched.die(code, after_s=101.0)
+    assert caught.value.exit_code == code
+    assert (watched.learner.starts, watched.actors.starts, watched.evaluator.starts) == (0, 0, 3)
+
+
+def test_rare_deaths_never_end_a_run(watched: Watched) -> None:
+    for _ in range(20):
+        watched.die(1, after_s=100.0)
+    assert watched.evaluator.starts == 20
+
+
+def test_one_that_found_no_learner_tries_for_ever(watched: Watched) -> None:
+    for _ in range(20):
+        watched.die(UnreachableError.exit_code)
+    assert watched.evaluator.starts == 20
+
+
+def test_one_that_left_in_peace_is_missed_only_while_the_learner_goes_on(watched: Watched) -> None:
+    watched.evaluator.exit_code = watched.actors.exit_code = 0
+    watched.look(0.0)
+    watched.look(10.0)
+    assert (watched.evaluator.starts, watched.actors.starts) == (0, 0), "the learner may follow yet"
+    watched.look(0.5)
+    assert (watched.evaluator.starts, watched.actors.starts) == (1, 1)
+    watched.evaluator.exit_code = watched.learner.exit_code = 0
+    watched.look(0.0)
+    watched.look(100.0)
+    assert (watched.evaluator.starts, watched.learner.starts) == (1, 0)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from liir_common.config import METHOD_PRESETS, PRESETS, AlgorithmConfig, EnvConfig
 from liir_common.rollout.play import make_player
 from liir_common.types import Batch, EnvSpec, Ticket, policy_shapes
-from services.learner.algorithms import Algorithm, make_algorithm
+from services.learner.algorithms import Algorithm, gru, gru_eager, make_algorithm
 from services.learner.algorithms.networks import views
 from services.learner.bench import bench_learner, synthetic_batch
 
@@ -232,6 +232,19 @@ def test_equal_seeds_learn_equally_and_leave_global_randomness_alone(method: str
     second.update(batch_of(0))
     assert_equal_states(first, second)
     assert not np.array_equal(first.policy()["fc1.weight"], make(method, seed=6).policy()["fc1.weight"])
+
+
+def test_an_update_without_compiled_recurrences_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A GPU has none of them."""
+    compiled, eager = make("liir"), make("liir")
+    before = compiled.state()
+    figures = compiled.update(batch_of(0))
+    monkeypatch.setattr(gru, "_recurrences", lambda tensor: gru_eager)
+    assert eager.update(batch_of(0)) == pytest.approx(figures, rel=1e-4)
+    wanted, got = compiled.state(), eager.state()
+    assert not torch.equal(got["policy.parameters"], wanted["policy.parameters"]), "both went the same way"
+    for name, value in wanted.items():
+        assert (got[name] - value).double().norm() <= 1e-4 * (value - before[name]).double().norm(), name
 
 
 @pytest.mark.parametrize("method", METHODS)

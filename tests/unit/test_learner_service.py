@@ -1,10 +1,11 @@
-"""What fails on the learner's event loop."""
+"""What fails on the learner's event loop, and where it trains."""
 
 import asyncio
 
 import pytest
+import torch
 
-from services.learner.service import _first_of, _OnLoop
+from services.learner.service import _first_of, _OnLoop, device
 
 
 async def fails() -> None:
@@ -25,3 +26,13 @@ def test_work_of_another_thread_that_fails_on_the_loop_ends_the_service(work: ob
 
     with pytest.raises(RuntimeError, match="broken"):
         asyncio.run(serve())
+
+
+@pytest.mark.parametrize("gpu", [True, False])
+def test_a_gpu_is_taken_where_there_is_one_unless_another_device_is_named(
+    monkeypatch: pytest.MonkeyPatch, gpu: bool
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: gpu)
+    assert device("auto") == torch.device("cuda" if gpu else "cpu")
+    assert device("cpu") == torch.device("cpu")
+    assert device("cuda") == torch.device("cuda")

@@ -65,8 +65,8 @@ class Reference:
 
     theta: Tensor
     eta_gradient: Tensor
-    objective: Tensor
-    """J_ex, whose gradient at θ' is v"""
+    outer_gradient: Tensor
+    """v, the gradient of J_ex by θ'"""
     proxy_return: Tensor
     extrinsic_return: Tensor
     theta_before: Tensor
@@ -135,6 +135,11 @@ def log_pi_of(pi: Tensor, batch: Batch) -> Tensor:
     return torch.where(weights_of(batch)[0] > 0, chosen, 1.0).log()
 
 
+def entropy_of(pi: Tensor) -> Tensor:
+    """H [B, T, n]"""
+    return -(pi * torch.where(pi > 0, pi, 1.0).log()).sum(-1)
+
+
 def weights_of(batch: Batch) -> tuple[Tensor, Tensor]:
     """w [B, T, n] and N."""
     before = np.zeros_like(batch.terminated)
@@ -171,16 +176,20 @@ def standardised(a: Tensor, w: Tensor, config: AlgorithmConfig) -> Tensor:
     return (a - mean) / ((w * (a - mean) ** 2).sum() / w.sum() + 1e-10).sqrt()
 
 
+def intrinsic_reward(eta: Tensor, batch: Batch, config: AlgorithmConfig) -> Tensor:
+    """r_in [B, T, n], 0 where w is 0"""
+    w, _ = weights_of(batch)
+    local = torch.cat([t64(batch.obs[:, :-1]), ids(*w.shape[:2])], -1)
+    out = mlp(eta, local, SPEC.n_actions).gather(-1, torch.as_tensor(batch.actions)[..., None]).squeeze(-1)
+    return config.r_in_bound * torch.tanh(out / config.r_in_bound) * w
+
+
 def proxy(eta: Tensor, state: State, batch: Batch, config: AlgorithmConfig) -> tuple[Tensor, Tensor]:
     """Returns and advantages [B, T, n] of r_proxy."""
     w, _ = weights_of(batch)
-    episodes, steps, _ = batch.log_mu.shape
-    local = torch.cat([t64(batch.obs[:, :-1]), ids(episodes, steps)], -1)
-    out = mlp(eta, local, SPEC.n_actions).gather(-1, torch.as_tensor(batch.actions)[..., None]).squeeze(-1)
-    r_in = config.r_in_bound * torch.tanh(out / config.r_in_bound)
-    r_proxy = t64(batch.reward)[..., None] + config.lambda_ * r_in * w
+    r_proxy = t64(batch.reward)[..., None] + config.lambda_ * intrinsic_reward(eta, batch, config)
     s = t64(batch.state)[:, :, None].expand(-1, -1, SPEC.n_agents, -1)
-    x = torch.cat([s, ids(episodes, steps + 1)], -1)
+    x = torch.cat([s, ids(*s.shape[:2])], -1)
     live, target = (scaled(mlp(state[k], x, 1).squeeze(-1), state, "phi") for k in critic_keys(state, "phi"))
     g = td_lambda(r_proxy, target, batch, config)
     return g, standardised(g - live[:, :-1], w, config)
@@ -234,8 +243,7 @@ def policy_gradient(theta: Tensor, a: Tensor, batch: Batch, config: AlgorithmCon
     else:
         low, high = 1 - config.ratio_clip, 1 + config.ratio_clip
         surrogate = torch.minimum(rho * a, rho.clamp(low, high) * a)
-    entropy = -(pi * torch.where(pi > 0, pi, 1.0).log()).sum(-1)
-    objective = (w * (surrogate + config.entropy * entropy)).sum() / n
+    objective = (w * (surrogate + config.entropy * entropy_of(pi))).sum() / n
     return torch.autograd.grad(objective, theta, create_graph=True)[0]
 
 
@@ -270,9 +278,27 @@ def reference(state: State, batch: Batch, config: AlgorithmConfig) -> Reference:
     before, theta = inner_steps(eta, state, batch, config)
     g_ex, a_ex = extrinsic(state, batch, config)
     objective = outer_objective(theta, batch, a_ex.detach(), config)
-    (gradient,) = torch.autograd.grad(objective, eta)
+    gradient, v = torch.autograd.grad(objective, [eta, theta])
     g_proxy, _ = proxy(eta.detach(), state, batch, config)
-    return Reference(theta.detach(), gradient, objective, g_proxy, g_ex, before)
+    return Reference(theta.detach(), gradient, v, g_proxy, g_ex, before)
+
+
+def figures_of(wanted: Reference, eta: Tensor, batch: Batch, config: AlgorithmConfig) -> dict[str, float]:
+    """Those of an update's figures that are one formula; the policy's are from before its last step."""
+    w, n = weights_of(batch)
+    pi = policy_probabilities(wanted.theta_before, batch, config.policy_hidden)
+    log_rho = log_pi_of(pi, batch) - t64(batch.log_mu)
+    intrinsic = config.lambda_ * intrinsic_reward(eta, batch, config).abs().sum() / n
+    extrinsic = np.abs(batch.reward[batch.filled]).astype(np.float64).mean()
+    figures = {
+        "eta_gradient_norm": (wanted.eta_gradient**2).sum().sqrt(),
+        "outer_gradient_norm": (wanted.outer_gradient**2).sum().sqrt(),
+        "intrinsic_reward": intrinsic,
+        "reward_ratio": intrinsic / extrinsic,
+        "policy_entropy": (w * entropy_of(pi)).sum() / n,
+        "policy_kl": (w * (log_rho.exp() - 1 - log_rho)).sum() / n,
+    }
+    return {name: float(figure) for name, figure in figures.items()}
 
 
 def eta_gradient(before: State, after: State) -> Tensor:
@@ -327,6 +353,8 @@ def test_update_equals_differentiating_through_the_inner_step(case: str) -> None
     config = config_of(CASES[case])
     algorithm, before = warmed(config)
     batch = batch_of(9, 9)
+    # Rewards of both signs, which their mean size must not cancel.
+    batch = replace(batch, reward=batch.reward - np.float32(0.3) * batch.filled)
     wanted = reference(before, batch, config)
     metrics = algorithm.update(batch)
     after = algorithm.state()
@@ -335,6 +363,8 @@ def test_update_equals_differentiating_through_the_inner_step(case: str) -> None
     close(eta_gradient(before, after), wanted.eta_gradient, 1e-9)
     close(after["phi.parameters"], fitted(before, "phi", wanted.proxy_return, batch, config), 1e-12)
     close(after["varphi.parameters"], fitted(before, "varphi", wanted.extrinsic_return, batch, config), 1e-12)
+    figures = figures_of(wanted, before["eta.parameters"], batch, config)
+    assert {name: metrics[name] for name in figures} == pytest.approx(figures, rel=1e-9)
     # The case has to exercise what it is there for.
     assert (metrics["clip_fraction"] > 0.01) == (config.policy_epochs > 1 or config.ratio_bound > 0)
     assert (metrics["policy_gradient_norm"] > config.policy_optimizer.clip) == (

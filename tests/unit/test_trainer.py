@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
 
-from liir_common import config, launch, metrics
+from liir_common import checkpoint, config, files, launch, metrics
+from liir_common.build import git_commit
+from liir_common.checkpoint import CheckpointStore, pack, section, unpack
 from liir_common.errors import CorruptError, DivergedError
 from liir_common.types import Batch, Weights
+from services.learner import run_directory
 from services.learner.algorithms import make_algorithm
 from services.learner.intake import Opening
 from services.learner.run_directory import RunDirectory
@@ -41,12 +45,15 @@ class Played:
             ],
         )
         self.openings: list[Opening] = []
+        self.published: list[tuple[int, bytes]] = []
+        """Version and policy of each opening."""
         self.run = RunDirectory(path, resolved, SPEC)
         algorithm = make_algorithm(SPEC, resolved.algorithm, 1, torch.device("cpu"))
         self.trainer = Trainer(self.run, algorithm, self._play, lambda: None)
 
     def _play(self, opening: Opening, weights: Weights) -> None:
         self.openings.append(opening)
+        self.published.append((opening.policy_version, pack(weights)))
         first = opening.batch * BATCH
         self.trainer.batches.put(
             [make_trajectory(first + i, opening.policy_version, STEPS) for i in range(BATCH)]
@@ -59,6 +66,12 @@ class Played:
     def digests(self) -> dict[int, str]:
         return {manifest.episode: manifest.sha256 for manifest in self.run.checkpoints.manifests}
 
+    def policies(self) -> dict[int, bytes]:
+        """The policy of each version that was frozen."""
+        store = self.run.checkpoints
+        frozen = {m.policy_version: unpack(store.read(m), m.sha256) for m in store.manifests}
+        return {version: pack(section(tensors, "policy")) for version, tensors in frozen.items()}
+
 
 @pytest.mark.parametrize(("interval", "frozen"), [(3, [3, 6, 9, 12]), (1, list(range(1, 13))), (5, [5, 10])])
 def test_every_multiple_of_the_interval_is_frozen(tmp_path: Path, interval: int, frozen: list[int]) -> None:
@@ -66,6 +79,8 @@ def test_every_multiple_of_the_interval_is_frozen(tmp_path: Path, interval: int,
     assert list(played.digests()) == frozen
     for manifest in played.run.checkpoints.manifests:
         assert manifest.policy_version == -(-manifest.episode // BATCH)
+        assert manifest.env_steps == manifest.policy_version * BATCH * STEPS
+        assert manifest.git_commit == git_commit() != ""
 
 
 @pytest.mark.parametrize("lag", [0, 1])
@@ -73,10 +88,44 @@ def test_batches_are_played_by_the_version_that_the_lag_says(tmp_path: Path, lag
     played = Played(tmp_path, 5, f"training.lag={lag}").train()
     assert [opening.batch for opening in played.openings] == list(range(5 + lag))
     assert [o.policy_version for o in played.openings] == [max(0, b - lag) for b in range(5 + lag)]
-    epsilons = [opening.epsilon for opening in played.openings]
-    assert epsilons == sorted(epsilons, reverse=True)
     lags = [int(row["policy_lag"]) for row in played.run.metrics.read()]
     assert lags == [min(step, lag) for step in range(5)]
+
+
+@pytest.mark.parametrize("lag", [0, 1])
+def test_a_batch_has_the_epsilon_of_the_steps_that_its_version_had(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lag: int
+) -> None:
+    # The last versions are past the end of the schedule.
+    played = Played(tmp_path, 6, f"training.lag={lag}", "algorithm.exploration.steps=80")
+    update, used = played.trainer.algorithm.update, []
+
+    def watched(batch: Batch, policy_ready: Callable[[], None]) -> dict[str, float]:
+        used.append(batch.epsilon)
+        return update(batch, policy_ready)
+
+    monkeypatch.setattr(played.trainer.algorithm, "update", watched)
+    played.train()
+    epsilon = played.run.config.algorithm.exploration.epsilon
+    wanted = [epsilon(opening.policy_version * BATCH * STEPS) for opening in played.openings]
+    assert [opening.epsilon for opening in played.openings] == wanted
+    assert used == wanted[:6]
+    assert len(set(used)) > 3
+
+
+@pytest.mark.parametrize("lag", [0, 1])
+def test_the_actors_get_the_weights_of_the_version_that_they_are_told(tmp_path: Path, lag: int) -> None:
+    settings = (f"training.lag={lag}", f"training.checkpoint_interval={BATCH}")
+    first = Played(tmp_path, 3, *settings)
+    initial = pack(first.trainer.algorithm.policy())
+    first.train()
+    resumed = Played(tmp_path, 6, *settings).train()
+    versions = {0: initial} | resumed.policies()
+    assert len(set(versions.values())) == 7
+    published = first.published + resumed.published
+    told = [version for version, _ in published]
+    assert set(told) == set(range(6))
+    assert published == [(version, versions[version]) for version in told]
 
 
 @pytest.mark.parametrize("lag", [0, 1])
@@ -138,6 +187,73 @@ def test_learning_that_diverged_is_an_error_that_nobody_tries_again(
     with pytest.raises(DivergedError, match=r"value_loss.*begin another run") as raised:
         played.train()
     assert raised.value.exit_code in launch._IN_VAIN
+
+
+class Died(Exception):
+    """What a process that is gone would not raise."""
+
+
+class Writes:
+    """Counts what goes to disk, and may let the process die in front of one write."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, dies_before: int | None = None) -> None:
+        """Watch every way to a file that a learner step has; the first write is number 0."""
+        self.count = 0
+        self._dies_before = dies_before
+        write_atomic = self._watched(files.write_atomic)
+        for module in (files, checkpoint, run_directory):
+            monkeypatch.setattr(module, "write_atomic", write_atomic)
+        monkeypatch.setattr(files, "_append_whole", self._watched(files._append_whole))
+
+    def _watched(self, write: Callable[[Path, bytes], None]) -> Callable[[Path, bytes], None]:
+        def watched(path: Path, data: bytes) -> None:
+            if self.count == self._dies_before:
+                raise Died
+            self.count += 1
+            write(path, data)
+
+        return watched
+
+
+CRASHING = ("training.checkpoint_interval=4", "training.save_interval=2", "algorithm=qmix", *REPLAY)
+WRITES = 19
+"""Of four such steps: a row, weights and a manifest each; a header of metrics.csv for the first, and for the
+second another, as only then the replay has enough to learn from; a replay and a state for every second; and a
+state at the end."""
+
+
+def left_behind(path: Path) -> tuple[dict[int, bytes], list[dict[str, str]]]:
+    """What whoever opens the run directory finds: all checkpoints' weights, and the rows without times."""
+    store = CheckpointStore(str(path / "checkpoints"))
+    rows = files.read_table(path / "metrics.csv")
+    for row in rows:
+        for column in ("time", "collect_s", "update_s"):
+            del row[column]
+    return {manifest.episode: store.read(manifest) for manifest in store.manifests}, rows
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("undisturbed")
+    played = Played(path, 4, *CRASHING)
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        writes = Writes(monkeypatch)
+        played.train()
+    assert writes.count == WRITES, "each of them wants its crash below"
+    return path
+
+
+@pytest.mark.parametrize("write", range(WRITES))
+def test_a_crash_in_front_of_any_write_changes_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, undisturbed: Path, write: int
+) -> None:
+    crashed = Played(tmp_path, 4, *CRASHING)
+    with monkeypatch.context() as patch:
+        Writes(patch, dies_before=write)
+        with pytest.raises(Died):
+            crashed.train()
+    Played(tmp_path, 4, *CRASHING).train()
+    assert left_behind(tmp_path) == left_behind(undisturbed)
 
 
 def test_stop_ends_a_trainer_that_waits(tmp_path: Path) -> None:

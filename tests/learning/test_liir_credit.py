@@ -149,4 +149,6 @@ def test_without_lambda_no_intrinsic_reward_reaches_the_policy() -> None:
     small, large = ({"r_in_gain": gain, "freeze_eta": True} for gain in (0.01, 1.0))
     control, weighted = {"lambda": 0.0}, {"lambda": 1.0}
     assert same(train(small | control, 0, updates=3).policy, train(large | control, 0, updates=3).policy)
-    assert not same(train(small | weighted, 0, updates=3).policy, train(large | weighted, 0, updates=3).policy)
+    assert not same(
+        train(small | weighted, 0, updates=3).policy, train(large | weighted, 0, updates=3).policy
+    )

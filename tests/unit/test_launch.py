@@ -70,25 +70,6 @@ def test_an_obituary_has_code_phase_exception_and_log(tmp_path: Path, last: str,
     assert "incarnation before" not in text
 
 
-class Silent(Program):
-    """A learner that never serves."""
-
-    def address(self) -> None:
-        return None
-
-
-def test_a_signal_before_the_learner_serves_ends_the_start(tmp_path: Path) -> None:
-    learner = Silent("learner", ["import time; time.sleep(60)"], tmp_path)
-    others = [Program(name, ["raise SystemExit"], tmp_path) for name in ("actor", "evaluator")]
-    launcher = Launcher(tmp_path, learner, *others, PLAINTEXT)
-    launcher._on_signal(signal.SIGINT, None)
-    try:
-        assert launcher._start(evaluate=True) is None
-    finally:
-        learner.end()
-    assert [service.exit_code for service in others] == [None, None], "neither was started"
-
-
 def test_what_the_learner_said_of_itself_counts_more_than_its_log(tmp_path: Path) -> None:
     service = LocalService("learner", [], tmp_path)
     service.log_path.parent.mkdir()
@@ -115,6 +96,14 @@ class Mortal(Service):
 
     def last_words(self) -> str:
         return ""
+
+
+def test_a_signal_before_the_learner_serves_ends_the_start(tmp_path: Path) -> None:
+    learner, actors, evaluator = (Mortal(name, [], tmp_path) for name in ("learner", "actor", "evaluator"))
+    launcher = Launcher(tmp_path, learner, actors, evaluator, PLAINTEXT)
+    launcher._on_signal(signal.SIGINT, None)
+    assert launcher._start(evaluate=True) is None
+    assert (learner.starts, actors.starts, evaluator.starts) == (1, 0, 0)
 
 
 class Watched:

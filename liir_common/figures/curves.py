@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from math import ceil
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,8 @@ _WINDOW = 10
 """Evaluations that a level is the mean of: one alone jumps between 0 and 1."""
 _GOAL = 0.9
 _POINTS = 200
+_PANELS = 5
+"""Maps in a row of the figure"""
 
 
 @dataclass(frozen=True)
@@ -174,9 +177,13 @@ def _draw(by_map: dict[str, dict[str, list[Curve]]], output: Path) -> None:
     from matplotlib.figure import Figure
 
     methods = list(dict.fromkeys(method for names in by_map.values() for method in names))
-    figure = Figure(figsize=(5 * len(by_map), 4), layout="constrained")
-    panels = figure.subplots(1, len(by_map), sharey=True, squeeze=False)[0]
-    for axes, (map_name, runs_of) in zip(panels, by_map.items(), strict=True):
+    columns = min(len(by_map), _PANELS)
+    rows = ceil(len(by_map) / columns)
+    figure = Figure(figsize=(5 * columns, 4 * rows), layout="constrained")
+    panels = figure.subplots(rows, columns, sharey=True, squeeze=False)
+    for axes in panels.flat[len(by_map) :]:
+        axes.remove()
+    for axes, (map_name, runs_of) in zip(panels.flat, by_map.items(), strict=False):
         for method, runs in runs_of.items():
             steps, mean, deviation = mean_curve(runs)
             colour = f"C{methods.index(method)}"  # the same in every panel
@@ -188,5 +195,6 @@ def _draw(by_map: dict[str, dict[str, list[Curve]]], output: Path) -> None:
         axes.legend(
             loc="upper center", bbox_to_anchor=(0.5, -0.15), ncols=3, frameon=False, title="method (seeds)"
         )
-    panels[0].set_ylabel("greedy win rate, mean ± deviation")
+    for axes in panels[:, 0]:
+        axes.set_ylabel("greedy win rate, mean ± deviation")
     figure.savefig(output, dpi=120)

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.image import imread
 
 from liir_common.errors import ConfigError
 from liir_common.figures.curves import markdown, mean_curve, points, tabulate, write_figure
@@ -102,6 +103,19 @@ def test_the_figure_is_a_picture_with_its_table(tmp_path: Path) -> None:
     assert (tmp_path / "out" / "figure3.png").read_bytes().startswith(b"\x89PNG")
     assert "| 3m | liir | 2 | 15,000 | 35.0 | 20.0 to 50.0 |" in (tmp_path / "out" / "figure3.md").read_text()
     assert [row["final"] for row in read_table(tmp_path / "out" / "figure3.csv")] == ["0.3500", "0.0000"]
+
+
+def test_more_than_five_maps_go_on_in_another_row(tmp_path: Path) -> None:
+    maps = ("3m", "8m", "2s3z", "3s5z", "MMM", "MMM2")
+    found = [
+        add_evaluations(make_run(tmp_path / name, f"env.map={name}", episodes=()), [4] * 3) for name in maps
+    ]
+    write_figure(read_curves(found), tmp_path / "six")
+    write_figure(read_curves(found[:5]), tmp_path / "five")
+    sizes = [
+        imread(tmp_path / folder / "figure3.png").shape[:2] for folder in ("six", "five")
+    ]  # rows, columns
+    assert sizes[0] == (2 * sizes[1][0], sizes[1][1])
 
 
 def test_what_cannot_be_a_curve_is_named(tmp_path: Path) -> None:

@@ -112,10 +112,10 @@ def test_more_than_five_maps_go_on_in_another_row(tmp_path: Path) -> None:
     ]
     write_figure(read_curves(found), tmp_path / "six")
     write_figure(read_curves(found[:5]), tmp_path / "five")
-    sizes = [
+    (height, width), one_row = (
         imread(tmp_path / folder / "figure3.png").shape[:2] for folder in ("six", "five")
-    ]  # rows, columns
-    assert sizes[0] == (2 * sizes[1][0], sizes[1][1])
+    )
+    assert (height, width) == (2 * one_row[0], one_row[1])
 
 
 def test_what_cannot_be_a_curve_is_named(tmp_path: Path) -> None:

@@ -7,8 +7,19 @@ adds is who may do what, the reward and the end of the episode.
 import numpy as np
 
 from liir_common import rng, seeds
-from liir_common.battle.motion import separate, squared_distance, walk
-from liir_common.battle.tables import ATTACK, ATTACK_MOVE, FIRST_ATTACK, IDLE, MOVE, apart, inlined, kernel
+from liir_common.battle.motion import separate, separate_many, squared_distance, walk
+from liir_common.battle.nearby import NOBODY, only
+from liir_common.battle.tables import (
+    ATTACK,
+    ATTACK_MOVE,
+    FIRST_ATTACK,
+    IDLE,
+    MOVE,
+    SET_SIZE,
+    apart,
+    inlined,
+    kernel,
+)
 from liir_common.battle.units import (
     BEAM_LENGTH,
     BEAM_WIDTH,
@@ -54,6 +65,7 @@ def reset(tables, battle, seed):
     battle.last_actions[:] = -1
     for i in range(len(battle.units)):
         battle.x[i], battle.y[i] = tables.specs[i].spawn_x, tables.specs[i].spawn_y
+        battle.alive[i] = True
         _spawn(battle.units[i], tables.specs[i], i >= n_allies)
     if rules.goal_span_x != 0.0 or rules.goal_span_y != 0.0:
         share = rng.uniform(battle.stream)
@@ -92,7 +104,6 @@ def _spawn(unit, spec, is_enemy):
     unit.order = ATTACK_MOVE if is_enemy else IDLE
     unit.target = unit.aim = unit.attacker = unit.missile_target = -1
     unit.hits = 0
-    unit.alive = True
 
 
 @kernel
@@ -154,7 +165,7 @@ def _judge(tables, battle):
 def _count_fighters(tables, battle, first, last):
     count = 0
     for i in range(first, last):
-        count += battle.units[i].alive and not tables.specs[i].heals
+        count += battle.alive[i] and not tables.specs[i].heals
     return count
 
 
@@ -176,7 +187,7 @@ def _reward(rules, status, lost_by_allies, lost_by_enemies, dead_allies, dead_en
 @inlined
 def _give_orders(tables, battle, actions):
     for i in range(tables.rules[0].n_allies):
-        if battle.units[i].alive:
+        if battle.alive[i]:
             if actions[i] >= FIRST_ATTACK:
                 _order_attack(tables, battle, i, actions[i] - FIRST_ATTACK)
             else:
@@ -227,18 +238,20 @@ def _play_loop(tables, battle, upwards):
     order, and the processor can guess what comes next.
     """
     now, n = battle.clock[0], len(battle.units)
-    walkers = 0
+    walkers = NOBODY
     for k in range(n):
         # Unsigned, so that no index needs a test for being negative.
         i = np.uint64(k if upwards else n - 1 - k)
-        if battle.units[i].alive:
-            walkers += _act(tables, battle, i, now, upwards)
+        if battle.alive[i]:
+            walkers |= np.uint64(_act(tables, battle, i, now, upwards)) * only(i)
     if tables.rules[0].has_missiles:
         _fly_missiles(tables, battle, now)
     if tables.rules[0].has_areas:
         _blast_all(tables, battle, now)
-    if walkers:
-        separate(tables, battle, now)
+    if n <= SET_SIZE:
+        separate(tables, battle, walkers)
+    else:
+        separate_many(tables, battle, now)
     battle.clock[0] = now + 1.0
 
 
@@ -246,8 +259,9 @@ def _play_loop(tables, battle, upwards):
 def _act(tables, battle, i, now, upwards):
     """What one unit does in one loop; whether it walks."""
     unit, spec = battle.units[i], tables.specs[i]
-    if unit.shield < spec.shield and now >= unit.hurt_at + _SHIELD_DELAY:
-        unit.shield = min(spec.shield, unit.shield + _SHIELD_PER_LOOP)
+    # No branch, which the processor would often guess wrongly.
+    shield = unit.shield + _SHIELD_PER_LOOP * (now >= unit.hurt_at + _SHIELD_DELAY)
+    unit.shield = shield if shield < spec.shield else spec.shield
     if spec.regeneration > 0.0:
         unit.health = min(spec.health, unit.health + spec.regeneration)
     if unit.hits > 0:
@@ -274,10 +288,10 @@ def _acquire(tables, battle, i, now, upwards):
 
     Equal distances are decided by where the look begins, and so by the step's coin toss.
     """
-    units, unit, kind, rules = battle.units, battle.units[i], tables.specs[i].kind, tables.rules[0]
+    unit, kind, rules = battle.units[i], tables.specs[i].kind, tables.rules[0]
     if unit.target >= 0:
         target = np.uint64(unit.target)
-        if units[target].alive:
+        if battle.alive[target]:
             distance2 = squared_distance(battle, i, target)
             if distance2 <= tables.pairs[kind, tables.specs[target].kind].hold2:
                 return
@@ -291,7 +305,7 @@ def _acquire(tables, battle, i, now, upwards):
     nearest2 = np.inf
     for k in range(rules.n_allies):
         j = np.uint64(k if upwards else rules.n_allies - 1 - k)
-        if units[j].alive:
+        if battle.alive[j]:
             distance2 = squared_distance(battle, i, j)
             if distance2 < nearest2 and distance2 <= tables.pairs[kind, tables.specs[j].kind].scan2:
                 nearest2 = distance2
@@ -317,7 +331,7 @@ def _attack(tables, battle, i, now):
     """
     unit, spec = battle.units[i], tables.specs[i]
     target = np.uint64(unit.target)
-    if not battle.units[target].alive:
+    if not battle.alive[target]:
         _rest(tables.rules[0], battle, i)
         return False
     x, y = battle.x[target] - battle.x[i], battle.y[target] - battle.y[i]
@@ -361,7 +375,7 @@ def _rest(rules, battle, i):
 def _release(tables, battle, i, now):
     """The next hit of the attack under way; a dead target ends the attack."""
     unit, spec = battle.units[i], tables.specs[i]
-    if not battle.units[unit.aim].alive and not (spec.beams and unit.hits == spec.hits):
+    if not battle.alive[unit.aim] and not (spec.beams and unit.hits == spec.hits):
         unit.hits = 0
         return
     if tables.rules[0].cooldown_from_release and unit.hits == spec.hits:
@@ -402,7 +416,7 @@ _strike = apart(_hit.py_func)
 def _die(tables, battle, i):
     unit, rules = battle.units[i], tables.rules[0]
     unit.health = unit.shield = 0.0
-    unit.alive = False
+    battle.alive[i] = False
     unit.hits = tables.specs[i].blast > 0.0
     battle.status[DEAD_ALLIES if i < rules.n_allies else DEAD_ENEMIES] += 1
 
@@ -421,7 +435,7 @@ def _respond(tables, battle, victim, now):
     caller.help_at = now
     for i in range(rules.n_allies, len(battle.units)):
         friend = battle.units[i]
-        waits = friend.alive and friend.order == ATTACK_MOVE and friend.target < 0
+        waits = battle.alive[i] and friend.order == ATTACK_MOVE and friend.target < 0
         if waits and squared_distance(battle, victim, i) <= HELP_RADIUS**2 and _can_hit(tables, i, attacker):
             friend.target = friend.attacker = attacker
 
@@ -448,7 +462,7 @@ def _beam(tables, battle, i, now):
     unit, spec, rules = battle.units[i], tables.specs[i], tables.rules[0]
     if unit.hits == 0:
         for _ in range(spec.beams):
-            if battle.units[unit.aim].alive:
+            if battle.alive[unit.aim]:
                 _strike(tables, battle, i, unit.aim, now)
         return
     x, y = unit.missile_x - battle.x[i], unit.missile_y - battle.y[i]
@@ -463,7 +477,7 @@ def _beam(tables, battle, i, now):
         within = 0.5 * BEAM_WIDTH + tables.specs[j].radius
         if j != unit.aim and beyond * beyond + away * away <= within * within and _can_hit(tables, i, j):
             for _ in range(spec.beams):
-                if battle.units[j].alive:
+                if battle.alive[j]:
                     _strike(tables, battle, i, j, now)
 
 
@@ -475,14 +489,14 @@ def _blast_all(tables, battle, now):
         more = False
         for i in range(len(battle.units)):
             unit, spec = battle.units[i], tables.specs[i]
-            if unit.alive or unit.hits == 0 or spec.blast == 0.0:
+            if battle.alive[i] or unit.hits == 0 or spec.blast == 0.0:
                 continue
             unit.hits = 0
             for j in range(_first_enemy(rules, i), _last_enemy(rules, i)):
                 within = spec.blast + tables.specs[j].radius
-                if battle.units[j].alive and squared_distance(battle, i, j) <= within * within:
+                if battle.alive[j] and squared_distance(battle, i, j) <= within * within:
                     _strike(tables, battle, i, j, now)
-                    more |= not battle.units[j].alive
+                    more |= not battle.alive[j]
 
 
 @apart
@@ -496,7 +510,7 @@ def _treat(tables, battle, i, now):
     if unit.target >= 0:
         patient, spec = battle.units[unit.target], tables.specs[unit.target]
         x, y = battle.x[unit.target] - battle.x[i], battle.y[unit.target] - battle.y[i]
-        if not patient.alive:
+        if not battle.alive[unit.target]:
             unit.order, unit.target = IDLE, -1
             return False
         if x * x + y * y <= tables.pairs[tables.specs[i].kind, spec.kind].reach2:
@@ -534,7 +548,7 @@ def _may_treat(tables, battle, i, j):
     """Whether j is alive, biological, hurt and within the search range of healer i."""
     spec = tables.specs[j]
     near = squared_distance(battle, i, j) <= tables.pairs[tables.specs[i].kind, spec.kind].scan2
-    return near and battle.units[j].alive and spec.biological and battle.units[j].health < spec.health
+    return near and battle.alive[j] and spec.biological and battle.units[j].health < spec.health
 
 
 @inlined
@@ -545,7 +559,7 @@ def _fly_missiles(tables, battle, now):
         unit = battle.units[i]
         if unit.missile_target >= 0:
             j = unit.missile_target
-            if not battle.units[j].alive:
+            if not battle.alive[j]:
                 unit.missile_target = _redirect(tables, battle, i)
                 continue
             x, y = battle.x[j] - unit.missile_x, battle.y[j] - unit.missile_y
@@ -570,6 +584,6 @@ def _redirect(tables, battle, i):
         0 if hits_allies else rules.n_allies, rules.n_allies if hits_allies else len(battle.units)
     ):
         distance2 = (battle.x[j] - unit.missile_x) ** 2 + (battle.y[j] - unit.missile_y) ** 2
-        if battle.units[j].alive and distance2 < nearest2:
+        if battle.alive[j] and distance2 < nearest2:
             nearest, nearest2 = j, distance2
     return nearest

@@ -146,10 +146,9 @@ class BattleEnv(ParallelEnv[str, Observation, np.int64]):
         if not self.agents:
             raise RuntimeError("no episode is running; call reset() before restore()")
         snapshots.put(self._tables, self._battle, self._unit_types, snapshot)
-        alive = self._battle.units["alive"]
-        n = len(self.possible_agents)
+        n, alive = len(self.possible_agents), self._battle.alive
         self._battle.status[engine.DEAD_ALLIES] = n - alive[:n].sum()
-        self._battle.status[engine.DEAD_ENEMIES] = len(alive) - n - alive[n:].sum()
+        self._battle.status[engine.DEAD_ENEMIES] = len(self._battle.units) - n - alive[n:].sum()
         self._observe()
 
     def render(self) -> str | NDArray[np.uint8] | None:

@@ -5,6 +5,7 @@ Compiled parts of the kernels in `engine`.
 
 import numpy as np
 
+from liir_common.battle.nearby import above, holds, lowest, members, near
 from liir_common.battle.tables import IDLE, apart, inlined
 from liir_common.battle.terrain import GROUND, MAP_SIZE
 
@@ -34,7 +35,9 @@ def walk(tables, battle, i, x, y, now):
         unit.pace = speed = min(
             speed, (unit.pace if unit.walked_at == now - 1.0 else 0.0) + spec.acceleration
         )
-    share = min(1.0, speed / np.sqrt(distance2))
+    share = speed / np.sqrt(distance2)
+    if share > 1.0:
+        share = 1.0
     unit.heading_x, unit.heading_y = x * share, y * share
     unit.walked_at = now
     _displace(tables, battle, i, unit.heading_x, unit.heading_y)
@@ -70,58 +73,59 @@ def _cell(position):
 
 
 @inlined
-def separate(tables, battle, now):
-    """Push overlapping discs apart; only units that walked in this loop can have made an overlap."""
+def separate(tables, battle, walkers):
+    """Push overlapping discs apart; only units that walked in this loop can have made an overlap.
+
+    For battles of SET_SIZE units at most. `walkers` is the set of those who walked; some may have died since.
+    """
+    living = members(battle.alive, 0)
+    left = walkers & living
+    while left:
+        i = lowest(left)
+        left &= above(i)
+        # Walkers below i have had their turn with it.
+        others = living & (above(i) | ~walkers)
+        contact2 = tables.contact2[tables.specs[i].kind]
+        touched = near(battle, i, contact2, 0, len(battle.units)) & others
+        while touched:
+            j = lowest(touched)
+            _part(tables, battle, i, j, holds(walkers, j))
+            touched = near(battle, i, contact2, 0, len(battle.units)) & others & above(j)
+
+
+@apart
+def separate_many(tables, battle, now):
+    """What `separate` does, one by one: for battles of any size."""
     for i in range(len(battle.units)):
-        if battle.units[i].walked_at == now and battle.units[i].alive:
+        if battle.units[i].walked_at == now and battle.alive[i]:
             contact2 = tables.contact2[tables.specs[i].kind]
-            # Everybody touches himself.
-            if _count_touched(battle, i, contact2) > 1:
-                _separate_one(tables, battle, i, contact2, now)
+            for j in range(len(battle.units)):
+                both_walked = battle.units[j].walked_at == now
+                had_turn = both_walked and j <= i
+                if squared_distance(battle, i, j) < contact2[j] and battle.alive[j] and not had_turn:
+                    _part(tables, battle, i, j, both_walked)
 
 
 @inlined
-def _count_touched(battle, i, contact2):
-    """How many units overlap i, dead or alive and i among them: a quick test for the common case."""
-    count = 0
-    for j in range(len(contact2)):
-        count += squared_distance(battle, i, j) < contact2[j]
-    return count
-
-
-@inlined
-def _separate_one(tables, battle, i, contact2, now):
-    for j in range(len(contact2)):
-        distance2 = squared_distance(battle, i, j)
-        if distance2 < contact2[j] and j != i and battle.units[j].alive:
-            both_walked = battle.units[j].walked_at == now
-            if not (both_walked and j < i):
-                contact = tables.pairs[tables.specs[i].kind, tables.specs[j].kind].contact
-                _part(tables, battle, i, j, np.sqrt(distance2), contact, both_walked)
-
-
-@inlined
-def _part(tables, battle, i, j, distance, contact, both_walked):
+def _part(tables, battle, i, j, both_walked):
     """Unit i walked into unit j: walkers and idle friends give way half, all others stand firm."""
-    rules, overlap, x, y = tables.rules[0], contact - distance, 1.0, 0.0
+    rules, distance, x, y = tables.rules[0], np.sqrt(squared_distance(battle, i, j)), 1.0, 0.0
+    overlap = tables.pairs[tables.specs[i].kind, tables.specs[j].kind].contact - distance
     if distance > 0.0:
         x, y = (battle.x[i] - battle.x[j]) / distance, (battle.y[i] - battle.y[j]) / distance
     is_friend = (i < rules.n_allies) == (j < rules.n_allies)
-    if both_walked:
-        _give_way(tables, battle, i, x, y, 0.5 * overlap)
-        _give_way(tables, battle, j, -x, -y, 0.5 * overlap)
-    elif rules.push_idle and is_friend and battle.units[j].order == IDLE:
-        _give_way(tables, battle, i, x, y, 0.5 * overlap)
-        _displace(tables, battle, j, -0.5 * overlap * x, -0.5 * overlap * y)
-    else:
-        _give_way(tables, battle, i, x, y, overlap)
+    is_shared = both_walked or (rules.push_idle and is_friend and battle.units[j].order == IDLE)
+    share = 0.5 * overlap if is_shared else overlap
+    _give_way(tables, battle, i, x, y, share, True)
+    if is_shared:
+        _give_way(tables, battle, j, -x, -y, share, both_walked)
 
 
 @inlined
-def _give_way(tables, battle, i, x, y, overlap):
-    """Back off along (x, y), away from the blocker, and go around it on the side of the heading."""
-    unit, slide = battle.units[i], 0.0
-    if unit.heading_x * x + unit.heading_y * y < 0.0:
-        leftward = unit.heading_y * x - unit.heading_x * y >= 0.0
-        slide = tables.rules[0].slide if leftward else -tables.rules[0].slide
+def _give_way(tables, battle, i, x, y, overlap, walks):
+    """Back off along (x, y), away from the blocker; who walks goes around it on the side of the heading."""
+    unit = battle.units[i]
+    is_headed = walks and unit.heading_x * x + unit.heading_y * y < 0.0
+    # No branch, which the processor would often guess wrongly.
+    slide = np.copysign(tables.rules[0].slide * is_headed, unit.heading_y * x - unit.heading_x * y + 0.0)
     _displace(tables, battle, i, overlap * (x - slide * y), overlap * (y + slide * x))

@@ -3,6 +3,7 @@
 import numpy as np
 
 from liir_common.battle.engine import NO_OP, NORTH, STEPS, STOP, WEST
+from liir_common.battle.nearby import above, lowest, members, near, only
 from liir_common.battle.tables import FIRST_ATTACK, SHOOT_RANGE, SIGHT, SURROUNDINGS, inlined, kernel
 
 MAP_SIZE = 32.0
@@ -19,12 +20,15 @@ def observe(tables, battle, obs, state, mask, alive):
     """Write the situation into obs [n, O], state [S], mask [n, A] and alive [n]."""
     obs[:] = 0.0
     mask[:] = False
-    for i in range(tables.rules[0].n_allies):
-        alive[i] = battle.units[i].alive
+    n_allies = tables.rules[0].n_allies
+    allies = members(battle.alive, 0) & ~above(n_allies - 1)
+    enemies = members(battle.alive, n_allies)
+    for i in range(n_allies):
+        alive[i] = battle.alive[i]
         if alive[i]:
             at = _write_moves(tables, battle, i, obs[i], mask[i])
-            at = _write_enemies(tables, battle, i, obs[i], mask[i], at)
-            at = _write_allies(tables, battle, i, obs[i], at)
+            at = _write_enemies(tables, battle, i, enemies, obs[i], mask[i], at)
+            at = _write_allies(tables, battle, i, allies, obs[i], at)
             _write_self(tables, battle, i, obs[i], at)
         else:
             mask[i, NO_OP] = True
@@ -82,28 +86,30 @@ def _is_open(pathing, x, y, outside):
 
 
 @inlined
-def _write_enemies(tables, battle, i, obs, mask, at):
-    """Features and attack availability of all enemies; returns where the next features go."""
+def _write_enemies(tables, battle, i, living, obs, mask, at):
+    """Features and attack availability of the living enemies; returns where the next features go."""
     rules = tables.rules[0]
     width = 4 + rules.obs_all_health * (1 + rules.enemy_shields) + rules.enemy_bits
     heals = rules.has_healers and tables.specs[i].heals
     if heals:
         _mask_heals(tables, battle, i, mask)
-    for j in range(rules.n_enemies):
-        other, spec = battle.units[rules.n_allies + j], tables.specs[rules.n_allies + j]
-        distance2 = _write_place(battle, i, rules.n_allies + j, obs, at)
-        if distance2 < SIGHT2:
-            # SMAC v1 looks a healer's slots up as if they were attacks.
-            if heals:
-                obs[at] = mask[FIRST_ATTACK + j]
-            else:
-                mask[FIRST_ATTACK + j] = obs[at] = distance2 <= SHOOT_RANGE2
-            if rules.obs_all_health:
-                _write_health(other, spec, rules.enemy_shields, obs, at + 4)
-            if rules.enemy_bits:
-                obs[at + width - rules.enemy_bits + spec.type_bit] = 1.0
-        at += width
-    return at
+    seen = near(battle, i, SIGHT2, rules.n_allies, len(battle.units)) & living
+    while seen:
+        k = lowest(seen)
+        seen &= above(k)
+        # Unsigned, so that no index needs a test for being negative.
+        j, start = np.uint32(rules.n_allies + k), np.uint32(at + k * width)
+        distance2 = _write_place(battle, i, j, obs, start)
+        # SMAC v1 looks a healer's slots up as if they were attacks.
+        if heals:
+            obs[start] = mask[FIRST_ATTACK + k]
+        else:
+            mask[FIRST_ATTACK + k] = obs[start] = distance2 <= SHOOT_RANGE2
+        if rules.obs_all_health:
+            _write_health(battle.units[j], tables.specs[j], rules.enemy_shields, obs, start + 4)
+        if rules.enemy_bits:
+            obs[start + width - rules.enemy_bits + tables.specs[j].type_bit] = 1.0
+    return at + rules.n_enemies * width
 
 
 @inlined
@@ -111,42 +117,40 @@ def _mask_heals(tables, battle, i, mask):
     """A healer's attack actions are for allies: all that are near and no healers, even in full health."""
     for j in range(min(tables.rules[0].n_allies, tables.rules[0].n_enemies)):
         x, y = battle.x[j] - battle.x[i], battle.y[j] - battle.y[i]
-        near = x * x + y * y <= SHOOT_RANGE2
-        mask[FIRST_ATTACK + j] = near and battle.units[j].alive and not tables.specs[j].heals
+        is_near = x * x + y * y <= SHOOT_RANGE2
+        mask[FIRST_ATTACK + j] = is_near and battle.alive[j] and not tables.specs[j].heals
 
 
 @inlined
-def _write_allies(tables, battle, i, obs, at):
-    """Features of all other allies; returns where the next features go."""
+def _write_allies(tables, battle, i, living, obs, at):
+    """Features of all other living allies; returns where the next features go."""
     rules = tables.rules[0]
     bits = 4 + rules.obs_all_health * (1 + rules.ally_shields)
     width = bits + rules.ally_bits + rules.obs_last_action * rules.n_actions
-    for j in range(rules.n_allies):
-        if j == i:
-            continue
-        if _write_place(battle, i, j, obs, at) < SIGHT2:
-            obs[at] = 1.0
-            if rules.obs_all_health:
-                _write_health(battle.units[j], tables.specs[j], rules.ally_shields, obs, at + 4)
-            if rules.ally_bits:
-                obs[at + bits + tables.specs[j].type_bit] = 1.0
-            if rules.obs_last_action and battle.last_actions[j] >= 0:
-                obs[at + bits + rules.ally_bits + battle.last_actions[j]] = 1.0
-        at += width
-    return at
+    seen = near(battle, i, SIGHT2, 0, rules.n_allies) & living & ~only(i)
+    while seen:
+        j = lowest(seen)
+        seen &= above(j)
+        start = np.uint32(at + (j - (j > i)) * width)
+        _write_place(battle, i, j, obs, start)
+        obs[start] = 1.0
+        if rules.obs_all_health:
+            _write_health(battle.units[j], tables.specs[j], rules.ally_shields, obs, start + 4)
+        if rules.ally_bits:
+            obs[start + bits + tables.specs[j].type_bit] = 1.0
+        if rules.obs_last_action and battle.last_actions[j] >= 0:
+            obs[start + bits + rules.ally_bits + battle.last_actions[j]] = 1.0
+    return at + (rules.n_allies - 1) * width
 
 
 @inlined
 def _write_place(battle, i, j, obs, at):
-    """Where unit j is for unit i, if it is alive and in sight; returns the squared distance or infinity."""
-    if not battle.units[j].alive:
-        return np.inf
+    """Where unit j is for unit i; returns the squared distance."""
     x, y = battle.x[j] - battle.x[i], battle.y[j] - battle.y[i]
     distance2 = x * x + y * y
-    if distance2 < SIGHT2:
-        obs[at + 1] = np.sqrt(distance2) * _PER_SIGHT
-        obs[at + 2] = x * _PER_SIGHT
-        obs[at + 3] = y * _PER_SIGHT
+    obs[at + 1] = np.sqrt(distance2) * _PER_SIGHT
+    obs[at + 2] = x * _PER_SIGHT
+    obs[at + 3] = y * _PER_SIGHT
     return distance2
 
 
@@ -178,7 +182,7 @@ def _write_state(tables, battle, state):
             (rules.ally_shields, rules.ally_bits) if is_ally else (rules.enemy_shields, rules.enemy_bits)
         )
         width = 3 + is_ally + shields + bits
-        if units[i].alive:
+        if battle.alive[i]:
             state[at] = units[i].health * specs[i].per_health
             if is_ally:
                 waits = max(0.0, units[i].ready_at - battle.clock[0])

@@ -137,7 +137,7 @@ def _attack_closest(tables, battle, targets, actions):
     """
     n_allies = tables.rules[0].n_allies
     for i in range(n_allies):
-        if not battle.units[i].alive:
+        if not battle.alive[i]:
             actions[i] = NO_OP
             continue
         first = 0 if tables.specs[i].heals else n_allies
@@ -154,7 +154,7 @@ def _attack_closest(tables, battle, targets, actions):
 @inlined
 def _is_worth(tables, battle, i, j):
     """Whether j is alive and one that i can do something about."""
-    unit, spec = battle.units[j], tables.specs[j]
+    spec = tables.specs[j]
     if tables.specs[i].heals:
-        return unit.alive and not spec.heals and unit.health < spec.health
-    return unit.alive and tables.pairs[tables.specs[i].kind, spec.kind].damage > 0.0
+        return battle.alive[j] and not spec.heals and battle.units[j].health < spec.health
+    return battle.alive[j] and tables.pairs[tables.specs[i].kind, spec.kind].damage > 0.0

@@ -81,7 +81,7 @@ def _record(tables: Tables, battle: Battle, i: int, unit_type: str) -> UnitRecor
         energy=float(unit["energy"]),
         cooldown=max(0.0, float(unit["ready_at"] - battle.clock[0])),
         radius=float(spec["radius"]),
-        alive=bool(unit["alive"]),
+        alive=bool(battle.alive[i]),
         order=ORDERS[unit["order"]],
         target=None if unit["target"] < 0 else int(unit["target"]) - _side(tables, i).start,
         goal_x=float(unit["goal_x"]),
@@ -144,7 +144,7 @@ def _put(tables: Tables, battle: Battle, i: int, record: UnitRecord) -> None:
     unit, now, target = battle.units[i], battle.clock[0], record["target"]
     battle.x[i], battle.y[i] = record["x"], record["y"]
     unit["health"], unit["shield"], unit["energy"] = record["health"], record["shield"], record["energy"]
-    unit["alive"], unit["order"] = record["alive"], ORDERS.index(record["order"])
+    battle.alive[i], unit["order"] = record["alive"], ORDERS.index(record["order"])
     unit["goal_x"], unit["goal_y"] = record.get("goal_x", record["x"]), record.get("goal_y", record["y"])
     unit["ready_at"], unit["free_at"], unit["hits"] = now + record["cooldown"], now, 0
     unit["hurt_at"] = now

@@ -50,6 +50,8 @@ FIRST_ATTACK = 6
 IDLE, MOVE, ATTACK, ATTACK_MOVE = range(4)
 """Only a unit that attack-moves picks targets of its own: all enemies do, no ally does."""
 ORDERS = ("idle", "move", "attack", "attack_move")
+SET_SIZE = 64
+"""The most units that a set of `nearby` holds, and so the largest team."""
 SIGHT, SHOOT_RANGE = 9.0, 6.0
 """SMAC v1's ranges, from centre to centre and for all unit types."""
 SURROUNDINGS = ((0, 2), (0, -2), (2, 0), (-2, 0), (1, 1), (-1, -1), (1, -1), (-1, 1))
@@ -107,8 +109,7 @@ UNIT = np.dtype(
             "walked_at", "pace", "heading_x", "heading_y", "goal_x", "goal_y", "missile_x", "missile_y",
         )
     ]
-    + [(name, np.int64) for name in ("order", "target", "aim", "hits", "attacker", "missile_target")]
-    + [("alive", np.bool_)],
+    + [(name, np.int64) for name in ("order", "target", "aim", "hits", "attacker", "missile_target")],
     align=True,
 )  # fmt: skip
 """The state of a unit. Unit numbers are -1 for nobody; `ready_at` is when the weapon may fire, `hit_at` when
@@ -126,7 +127,7 @@ class Tables(NamedTuple):
     pairs: NDArray[np.void]
     """[kinds, kinds] of PAIR"""
     contact2: NDArray[np.float64]
-    """[kinds, units], the squared distance at which a unit of that kind touches that unit"""
+    """[kinds, room], the squared distance at which a unit of that kind touches that unit"""
     pathing: NDArray[np.bool_]
     """[32, 32] by (x, y), as SMAC v1 sees it"""
     layers: NDArray[np.bool_]
@@ -138,12 +139,18 @@ class Tables(NamedTuple):
 
 
 class Battle(NamedTuple):
-    """All that changes."""
+    """All that changes.
+
+    Positions and lives have arrays of their own, of which `nearby` makes sets of units; all have room for
+    SET_SIZE more behind the last unit, who never live.
+    """
 
     x: NDArray[np.float64]
-    """[units]; positions have arrays of their own because most of the time goes into distances"""
+    """[room]"""
     y: NDArray[np.float64]
-    """[units]"""
+    """[room]"""
+    alive: NDArray[np.bool_]
+    """[room]"""
     units: NDArray[np.void]
     """[units] of UNIT"""
     status: NDArray[np.int64]
@@ -212,10 +219,17 @@ def _is_free(place: _Place, body: float, discs: Sequence[_Disc], ground: NDArray
 
 
 def build_tables(scenario: Scenario, settings: Settings) -> Tables:
-    """Compile a scenario and settings into arrays."""
+    """Compile a scenario and settings into arrays.
+
+    Raises:
+        ValueError: a team is too large.
+    """
     terrain = TERRAINS[scenario.terrain]
     units, spawns = roster(scenario, settings)
     n_allies = sum(spawn.count for spawn in scenario.allies)
+    sizes = n_allies, len(units) - n_allies
+    if max(sizes) > SET_SIZE:
+        raise ValueError(f"{scenario.name} wants teams of at most {SET_SIZE} units, got {sizes}")
     # By name: teams may differ in how fast a type is, but not in how it fights.
     kinds = {unit.name: unit for unit in units}
     kind_names = list(kinds)
@@ -232,7 +246,7 @@ def build_tables(scenario: Scenario, settings: Settings) -> Tables:
         rules=rules,
         specs=specs,
         pairs=pairs,
-        contact2=pairs["contact"].take(specs["kind"], axis=1) ** 2,
+        contact2=np.pad(pairs["contact"].take(specs["kind"], axis=1) ** 2, ((0, 0), (0, SET_SIZE))),
         pathing=terrain.pathing,
         layers=terrain.layers,
         height=terrain.height,
@@ -363,10 +377,11 @@ def _reward_divisor(settings: Settings, enemies: Sequence[UnitType]) -> float:
 
 def build_battle(tables: Tables) -> Battle:
     """A battle to be started with `engine.reset`."""
-    n_allies = int(tables.rules["n_allies"][0])
+    n_allies, room = int(tables.rules["n_allies"][0]), tables.contact2.shape[1]
     return Battle(
-        x=np.zeros(len(tables.specs)),
-        y=np.zeros(len(tables.specs)),
+        x=np.zeros(room),
+        y=np.zeros(room),
+        alive=np.zeros(room, np.bool_),
         units=np.zeros(len(tables.specs), UNIT),
         status=np.zeros(7, np.int64),
         last_actions=np.full(n_allies, -1, np.int64),

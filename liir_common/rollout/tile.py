@@ -11,7 +11,9 @@ from numba.core import cgutils, types
 from numba.core.errors import RequireLiteralValue, TypingError
 from numba.extending import intrinsic
 
-_FLOAT, _BYTE, _INDEX = ir.FloatType(), ir.IntType(8), ir.IntType(32)
+from liir_common.llvm import broadcast
+
+_FLOAT, _BYTE = ir.FloatType(), ir.IntType(8)
 _CONTRACT = ("contract",)
 
 
@@ -74,17 +76,10 @@ def _generate(b: Any, matrices: Any, shape: list[int], row: Any, column: Any) ->
     with cgutils.for_range(b, x.columns) as loop:
         weights = [load(weight, loop.index, c) for c in columns]
         for r, line in zip(rows_, sums, strict=True):
-            factor = _everywhere(b, b.load(x.pointer(r, loop.index, _FLOAT)), vector)
+            factor = broadcast(b, b.load(x.pointer(r, loop.index, _FLOAT)), vector)
             for total, w in zip(line, weights, strict=True):
                 product = b.fmul(factor, w, flags=_CONTRACT)
                 b.store(b.fadd(b.load(total), product, flags=_CONTRACT), total)
     for r, line in zip(rows_, sums, strict=True):
         for c, total in zip(columns, line, strict=True):
             b.store(b.load(total), out.pointer(r, c, vector), align=4)
-
-
-def _everywhere(b: Any, value: Any, vector: Any) -> Any:
-    """A vector with `value` in every lane."""
-    undefined = ir.Constant(vector, ir.Undefined)
-    first = b.insert_element(undefined, value, _INDEX(0))
-    return b.shuffle_vector(first, undefined, ir.Constant(ir.VectorType(_INDEX, vector.count), None))

@@ -40,7 +40,7 @@ def check_units(env: BattleEnv) -> None:
 def check_dead(env: BattleEnv, dead: Any, x: Any, y: Any, before: Any) -> None:
     """Units that were dead a step ago are so still, have not moved, and have begun nothing."""
     after = env._battle.units[dead]
-    assert not after["alive"].any()
+    assert not env._battle.alive[dead].any()
     assert np.array_equal((env._battle.x[dead], env._battle.y[dead]), (x, y))
     for name in ("health", "shield", "ready_at", "hit_at", "aim"):
         assert np.array_equal(after[name], before[name])
@@ -62,7 +62,7 @@ def test_invariants(map_name: str, seed: int, bold: bool) -> None:
     total, limit = 0.0, int(env._tables.rules["limit"][0])
     started_with = vitality(env, "enemy")
     for _ in range(limit):
-        dead = np.flatnonzero(~env._battle.units["alive"])
+        dead = np.flatnonzero(~env._battle.alive[: len(env._battle.units)])
         before = env._battle.x[dead], env._battle.y[dead], env._battle.units[dead]
         actions = {}
         for agent in env.agents:

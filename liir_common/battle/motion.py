@@ -68,8 +68,8 @@ def _displace(tables, battle, i, x, y):
 
 @inlined
 def _cell(position):
-    """The cell of a position along one axis; the map's size is a power of two, so masking keeps within it."""
-    return np.uint32(np.int64(position) & (MAP_SIZE - 1))
+    """The cell of a position along one axis; beyond the map that at its border, which no layer can enter."""
+    return np.uint32(min(max(int(position), 0), MAP_SIZE - 1))
 
 
 @inlined

@@ -1,7 +1,8 @@
 """Sets of units as the bits of an integer: who is alive and who is near, for many units at once.
 
 A loop over such a set visits only its members, and needs no branch that the processor could guess wrongly for
-all the others. Bit k of a set stands for unit first + k, where `first` goes with the set.
+all the others. Bit k of a set stands for unit first + k, where `first` goes with the set. How vectors become
+bits is as on little-endian machines.
 """
 
 from typing import Any
@@ -23,33 +24,33 @@ NOBODY, _ONE = np.uint64(0), np.uint64(1)
 
 @inlined
 def near(battle, i, radii2, first, last):
-    """The units from `first` up to `last` that are nearer to i than a radius: i itself, and the dead too.
+    """The units from `first` to before `last` that are nearer to i than a radius: i itself, and the dead too.
 
-    `radii2` is the square of that radius, or the squares [room] for every unit. Behind `last` there may be
-    more in the set.
+    They are SET_SIZE at most. `radii2` is the square of that radius, or the squares [room] for every unit. Of
+    the few places from `last` on that share its last comparison, the set may hold some as well.
     """
     found = NOBODY
     for j in range(first, last, _LANES):
-        found |= _compare(battle.x, battle.y, radii2, j, battle.x[i], battle.y[i]) << np.uint64(j - first)
+        found |= _closer(battle.x, battle.y, radii2, j, battle.x[i], battle.y[i]) << np.uint64(j - first)
     return found
 
 
 @inlined
 def holds(numbers, k):
-    """Whether bit k is in the set."""
+    """Whether bit k, below SET_SIZE, is in the set."""
     return (numbers >> np.uint64(k)) & _ONE != NOBODY
 
 
 @inlined
 def only(k):
-    """The set of bit k alone."""
-    # Shifting by more than a set has bits is undefined: larger battles make sets that nobody looks at.
+    """The set of bit k alone; from SET_SIZE on k begins again at 0."""
+    # A shift by so much is undefined, and larger battles ask for it, though for a set that nobody looks at.
     return _ONE << (np.uint64(k) & np.uint64(SET_SIZE - 1))
 
 
 @inlined
 def above(k):
-    """The set of all bits above k, which is one of them."""
+    """The set of all bits above k, itself not among them; k is below SET_SIZE."""
     return ~((only(k) << _ONE) - _ONE)
 
 
@@ -75,7 +76,7 @@ def _members(typing_context, truths, first):
     return types.uint64(truths, types.intp), generate
 
 
-def _closer(typing_context, x, y, radii2, first, at_x, at_y):
+def _places_closer(typing_context, x, y, radii2, first, at_x, at_y):
     """The set of those of _LANES places from `first` on that are `near` (at_x, at_y)."""
     one_radius = isinstance(radii2, types.Float)
     arrays = (x, y) if one_radius else (x, y, radii2)
@@ -97,7 +98,7 @@ def _closer(typing_context, x, y, radii2, first, at_x, at_y):
 
 lowest: Any = intrinsic(_lowest)
 members: Any = intrinsic(_members)
-_compare: Any = intrinsic(_closer)
+_closer: Any = intrinsic(_places_closer)
 
 
 def _load(context: Any, b: Any, kind: Any, array: Any, first: Any, vector: Any) -> Any:

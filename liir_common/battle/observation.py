@@ -8,7 +8,7 @@ from liir_common.battle.tables import FIRST_ATTACK, SHOOT_RANGE, SIGHT, SURROUND
 
 MAP_SIZE = 32.0
 _CENTRE = MAP_SIZE / 2.0
-# Products instead of quotients, which take several times as long; float32 shows no difference.
+# Products instead of quotients, which take several times as long; they differ in the last bit at most.
 _PER_SIGHT = 1.0 / SIGHT
 SIGHT2, SHOOT_RANGE2 = SIGHT**2, SHOOT_RANGE**2
 _MOVES = WEST - STOP

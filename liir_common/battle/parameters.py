@@ -22,7 +22,7 @@ class Options:
     """SMAC v1's options, under its names and with its defaults.
 
     Those that concern the game's window, version, difficulty and replays have nothing to act on here;
-    `heuristic_ai` and `heuristic_rest` are policies (`policies.CLOSEST_ENEMY`).
+    `heuristic_ai` is a policy (`policies.CLOSEST_ENEMY`); `heuristic_rest`, which changes it, is not there.
     """
 
     step_mul: int = field(default=8, metadata={"minimum": 1, "maximum": 1000})

@@ -171,7 +171,7 @@ _SCENARIOS = (
         hunts=True,
         limit=400,
         terrain="ravine",
-        uncertain=f"{_BEAMS}; which colossus a zergling is sent to (hunt_nearest)",
+        uncertain=f"{_BEAMS}; which colossus a zergling is sent to (hunt_nearest), and what it does then",
     ),
     Scenario(
         "6h_vs_8z",

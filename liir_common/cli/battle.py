@@ -23,9 +23,10 @@ def maps(as_json: Json = False) -> None:
         print(json.dumps(rows))
         return
     from rich.console import Console
-    from rich.table import Table
+    from rich.table import Column, Table
 
-    table = Table("map", "agents", "enemies", "actions", "limit", "terrain", "uncertain")
+    name = Column("map", no_wrap=True)
+    table = Table(name, "agents", "enemies", "actions", "limit", "terrain", "uncertain")
     for row in rows:
         sides = [_roll(row["agents"]), _roll(row["enemies"])]
         table.add_row(

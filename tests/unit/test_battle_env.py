@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import pickle
 from copy import deepcopy
@@ -20,7 +21,7 @@ from liir_common.battle.bench import bench_sim
 from liir_common.battle.calibrate import POLICIES, TARGETS, calibrate, estimate, format_rows
 from liir_common.battle.engine import SIMULATOR_VERSION
 from liir_common.battle.env import BattleEnv, battle_spec, parallel_env
-from liir_common.battle.policies import play
+from liir_common.battle.policies import RANDOM, play
 from liir_common.battle.render import LETTERS, Shot, draw_rgb
 from liir_common.battle.scenarios import SCENARIOS, make_battle
 from liir_common.battle.units import UNIT_TYPES
@@ -423,6 +424,14 @@ def test_bench_tells_compiling_from_loading(monkeypatch: pytest.MonkeyPatch) -> 
     assert 0 < seconds["load_s"] < seconds["compile_s"]
 
 
+def test_other_battles_have_another_version() -> None:
+    """Whoever changes what happens raises SIMULATOR_VERSION, and writes down what happens now."""
+    digest = hashlib.sha256()
+    for name in SCENARIOS:
+        digest.update(play(make_battle(name)[0], RANDOM, episodes=3, seed=1).round(9).tobytes())
+    assert (SIMULATOR_VERSION, digest.hexdigest()[:16]) == ("2", "ba569666507338eb")
+
+
 def test_maps_are_listed() -> None:
     listed = CliRunner().invoke(app, ["maps", "--json"])
     assert listed.exit_code == 0
@@ -436,5 +445,6 @@ def test_maps_are_listed() -> None:
         assert row["uncertain"]
     assert rows["MMM2"]["enemies"] == {"marine": 8, "marauder": 3, "medivac": 1}
     assert rows["2c_vs_64zg"]["agents"] == {"colossus": 2}
-    table = CliRunner().invoke(app, ["maps"], env={"COLUMNS": "200"}).stdout
-    assert all(name in table for name in rows)
+    for width in ("80", "200"):
+        table = CliRunner().invoke(app, ["maps"], env={"COLUMNS": width}).stdout
+        assert all(f" {name} " in table for name in rows)

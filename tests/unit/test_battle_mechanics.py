@@ -487,6 +487,17 @@ def test_a_medivac_flies_up_slowly_and_over_others() -> None:
     assert unit(env, "ally", 4)["health"] > 5.0
 
 
+def test_nobody_is_pushed_off_the_map() -> None:
+    """Two aircraft at its very border, one of which flies into the other."""
+    env = parallel_env("MMM", obs_terrain_height=True)
+    stage(env, {("ally", MEDIVAC): {"x": 30.98, "y": 15.97}, ("enemy", MEDIVAC): {"x": 30.96, "y": 16.0}})
+    env._masks[MEDIVAC, NORTH] = True
+    play(env, {MEDIVAC: NORTH})
+    ally = unit(env, "ally", MEDIVAC)
+    assert ally["x"] < MAP_SIZE - 1
+    assert ally["y"] < 15.5, "pushed back all the same"
+
+
 def test_an_enemy_medivac_treats_the_worst_hurt_of_its_own_accord() -> None:
     env = parallel_env("MMM")
     medivac = {"x": 20.0, "y": 15.0, "order": "attack_move"}

@@ -132,8 +132,10 @@ class LocalService(Service):
 
     def start(self) -> None:
         """Start it in a process group of its own, so that Ctrl-C reaches only the launcher."""
-        self.log_path.parent.mkdir(parents=True, exist_ok=True)
-        with self.log_path.open("ab") as file:
+        with storage_explained(self.run_dir):
+            self.log_path.parent.mkdir(parents=True, exist_ok=True)
+            log_file = self.log_path.open("ab")
+        with log_file as file:
             self._log_begin = file.tell()
             self._process = subprocess.Popen(
                 self.command,
@@ -385,9 +387,10 @@ def _run_name(config: Config) -> str:
 
 
 def _newest_run() -> Path:
-    runs = sorted(Path("runs").glob("*/run.json"), key=lambda path: path.stat().st_mtime)
+    # What has no step has nothing to go on with: its start may have failed, at a port that was taken.
+    runs = sorted(Path("runs").glob("*/metrics.csv"), key=lambda path: path.stat().st_mtime)
     if not runs:
-        raise ConfigError("there is no run under runs/ to resume; name one with --run-dir")
+        raise ConfigError("there is no run under runs/ with a step to go on from; name one with --run-dir")
     return runs[-1].parent
 
 

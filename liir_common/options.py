@@ -2,14 +2,14 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 import yaml
 
 from liir_common import config
 from liir_common.config import Config, SecurityConfig
-from liir_common.errors import ConfigError
+from liir_common.errors import ConfigError, CorruptError
 
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="YAML file with the configuration.")]
 Settings = Annotated[
@@ -62,15 +62,26 @@ def load_run_config(
     Raises:
         ConfigError: there is a run and `resume` is false, or the other way round, or the configuration
             cannot be used, or a resumed run would go on with what it did not begin with.
+        CorruptError: the configuration that a run keeps is damaged.
     """
     if run_dir is not None:
         _check_run_dir(run_dir, resume)
     if not resume or run_dir is None:
         return config.load(file, settings or ())
-    kept = yaml.safe_load((run_dir / "config.yaml").read_text(encoding="utf-8"))
+    kept = _kept_tree(run_dir / "config.yaml")
     resumed = config.from_tree(config.merge(kept, config.parse_settings(settings or ())))
     _check_same_run(config.from_tree(kept), resumed, run_dir)
     return resumed
+
+
+def _kept_tree(path: Path) -> dict[str, Any]:
+    try:
+        tree = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, ValueError) as error:
+        raise CorruptError(f"{path} is damaged ({error}); restore it from a backup") from error
+    if not isinstance(tree, dict):
+        raise CorruptError(f"{path} is damaged: wanted sections, got {tree!r}; restore it from a backup")
+    return tree
 
 
 def _check_same_run(kept: Config, resumed: Config, run_dir: Path) -> None:

@@ -2,7 +2,7 @@
 
 config.yaml      the resolved configuration
 run.json         run id, build, environment, parameter counts
-endpoints.json   where the learner listens while it runs
+endpoints.json   where the learner listens, or did last
 state/           the learner's own state at the last saves, and the replay if the method has one
 checkpoints/     frozen checkpoints
 metrics.csv      one row per learner step
@@ -54,6 +54,7 @@ class RunDirectory:
 
         Raises:
             ConfigError: the run that is there plays another environment.
+            CorruptError: its record is damaged.
         """
         self.path = path
         self.config = config
@@ -135,8 +136,12 @@ class RunDirectory:
         return None
 
     def _read_record(self) -> dict[str, Any]:
-        record: dict[str, Any] = json.loads((self.path / "run.json").read_text())
-        return record
+        path = self.path / "run.json"
+        try:
+            record: dict[str, Any] = json.loads(path.read_text())
+            return {"run_id": record["run_id"], "created": record["created"]} | record
+        except (KeyError, TypeError, ValueError) as error:
+            raise CorruptError(f"{path} is damaged ({error!r}); restore it from a backup") from error
 
     def _state_paths(self) -> list[Path]:
         return sorted((self.path / "state").glob("state-*.safetensors"))

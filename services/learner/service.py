@@ -11,7 +11,7 @@ import torch
 
 from liir_common import metrics, seeds
 from liir_common.config import Config
-from liir_common.errors import storage_explained
+from liir_common.errors import ConfigError, storage_explained
 from liir_common.rpc.gen.liir.v1 import (
     checkpoint_pb2_grpc,
     rollout_pb2_grpc,
@@ -140,7 +140,15 @@ async def _first_of(*awaitables: Awaitable[object]) -> None:
 
 
 def device(name: str) -> torch.device:
-    """The device to train on: "auto" takes a GPU when there is one."""
+    """The device to train on: "auto" takes a GPU when there is one.
+
+    Raises:
+        ConfigError: "cuda", and torch sees none.
+    """
+    if name == "cuda" and not torch.cuda.is_available():
+        raise ConfigError(
+            "learner.device: wanted a CUDA device, torch sees none; set auto or cpu, or mend the driver"
+        )
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
     return torch.device(name)

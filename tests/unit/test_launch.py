@@ -177,3 +177,22 @@ def test_one_that_left_in_peace_is_missed_only_while_the_learner_goes_on(watched
     watched.look(0.0)
     watched.look(100.0)
     assert (watched.evaluator.starts, watched.learner.starts) == (1, 0)
+
+
+def test_a_run_directory_that_is_a_file_is_explained(tmp_path: Path) -> None:
+    (tmp_path / "run").touch()
+    with pytest.raises(StorageError, match=r"cannot write to .*run.*: Not a directory"):
+        LocalService("learner", [], tmp_path / "run").start()
+
+
+def test_the_newest_run_is_one_that_made_a_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not one whose port was taken when it began."""
+    monkeypatch.chdir(tmp_path)
+    for name, files in (("trained", ("run.json", "metrics.csv")), ("failed", ("run.json",))):
+        (tmp_path / "runs" / name).mkdir(parents=True)
+        for file in files:
+            (tmp_path / "runs" / name / file).touch()
+    assert launch._newest_run() == Path("runs/trained")
+    (tmp_path / "runs/trained/metrics.csv").unlink()
+    with pytest.raises(ConfigError, match="no run under runs/ with a step to go on from"):
+        launch._newest_run()

@@ -5,6 +5,7 @@ import asyncio
 import pytest
 import torch
 
+from liir_common.errors import ConfigError
 from services.learner.service import _first_of, _OnLoop, device
 
 
@@ -35,4 +36,8 @@ def test_a_gpu_is_taken_where_there_is_one_unless_another_device_is_named(
     monkeypatch.setattr(torch.cuda, "is_available", lambda: gpu)
     assert device("auto") == torch.device("cuda" if gpu else "cpu")
     assert device("cpu") == torch.device("cpu")
-    assert device("cuda") == torch.device("cuda")
+    if gpu:
+        assert device("cuda") == torch.device("cuda")
+    else:
+        with pytest.raises(ConfigError, match=r"learner\.device: wanted a CUDA device, torch sees none"):
+            device("cuda")

@@ -6,7 +6,7 @@ import pytest
 import yaml
 
 from liir_common import options
-from liir_common.errors import ConfigError
+from liir_common.errors import ConfigError, CorruptError
 from tests.trained import make_run
 
 
@@ -42,3 +42,11 @@ def test_a_run_of_an_older_build_has_the_defaults_of_what_it_did_not_know(tmp_pa
     del tree["algorithm"]["ratio_bound"]
     (run_dir / "config.yaml").write_text(yaml.safe_dump(tree))
     assert options.load_run_config(None, [], run_dir, resume=True).algorithm.ratio_bound == 0
+
+
+@pytest.mark.parametrize("text", ["seed: [", "- 1"])
+def test_a_damaged_configuration_is_explained(text: str, tmp_path: Path) -> None:
+    run_dir = make_run(tmp_path / "run", episodes=())
+    (run_dir / "config.yaml").write_text(text)
+    with pytest.raises(CorruptError, match=r"config\.yaml is damaged"):
+        options.load_run_config(None, [], run_dir, resume=True)

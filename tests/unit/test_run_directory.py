@@ -91,5 +91,12 @@ def test_a_run_keeps_its_id_and_its_environment(run: RunDirectory) -> None:
         RunDirectory(run.path, config.load(), replace(SPEC, version="2"))
 
 
+@pytest.mark.parametrize("record", ['{"run_id": "a', "[]", "{}"])
+def test_a_damaged_record_is_explained(run: RunDirectory, record: str) -> None:
+    (run.path / "run.json").write_text(record)
+    with pytest.raises(CorruptError, match=r"run\.json is damaged .*; restore it from a backup"):
+        RunDirectory(run.path, config.load(), SPEC)
+
+
 def test_config_is_kept_resolved(run: RunDirectory) -> None:
     assert config.load(run.path / "config.yaml", ["preset=none"]).algorithm == config.load().algorithm

@@ -14,7 +14,7 @@ import yaml
 
 from liir_common.checkpoint import CheckpointStore
 from liir_common.files import read_table
-from tests.ray_submit.machines import SSHD, VENV, Machine
+from tests.ray_submit.machines import ENVIRONMENT, SSHD, VENV, Machine
 
 pytestmark = [pytest.mark.ray_submit, pytest.mark.timeout(1200)]
 
@@ -90,6 +90,9 @@ class Cluster:
 @pytest.fixture
 def cluster(tmp_path: Path) -> Iterator[Cluster]:
     """Three machines that are on."""
+    missing = [tool for tool in ("sshd", "rsync", "ip") if not shutil.which(tool, path=ENVIRONMENT["PATH"])]
+    if missing:
+        pytest.fail(f"wants {', '.join(missing)}: apt-get install openssh-server rsync iproute2")
     cluster = Cluster(tmp_path)
     try:
         yield cluster

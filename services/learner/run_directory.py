@@ -138,10 +138,12 @@ class RunDirectory:
     def _read_record(self) -> dict[str, Any]:
         path = self.path / "run.json"
         try:
-            record: dict[str, Any] = json.loads(path.read_text())
-            return {"run_id": record["run_id"], "created": record["created"]} | record
-        except (KeyError, TypeError, ValueError) as error:
-            raise CorruptError(f"{path} is damaged ({error!r}); restore it from a backup") from error
+            record = json.loads(path.read_text())
+        except ValueError as error:
+            raise CorruptError(f"{path} is damaged ({error}); restore it from a backup") from error
+        if not isinstance(record, dict) or not {"run_id", "created"} <= record.keys():
+            raise CorruptError(f"{path} is damaged (no run_id or created); restore it from a backup")
+        return record
 
     def _state_paths(self) -> list[Path]:
         return sorted((self.path / "state").glob("state-*.safetensors"))

@@ -68,13 +68,13 @@ def bench_train(map_name: str, env_steps: int, settings: Sequence[str] = ()) -> 
 
 
 def _watch(process: subprocess.Popen[bytes], run_dir: Path, total: int) -> dict[str, float]:
-    """Largest PSS of the learner and of an actor, MiB, read once in the second half of the run."""
+    """PSS of the learner's two processes and of the largest actor, MiB, read once past half of the run."""
     while process.poll() is None:
         rows = read_table(run_dir / "metrics.csv")
         if rows and int(rows[-1]["env_steps"]) > total / 2:
             break
         time.sleep(_POLL_S * 10)
-    largest = {"learner_pss_mib": 0.0, "actor_pss_mib": 0.0, "actors": 0.0}
+    found = {"learner_pss_mib": 0.0, "actor_pss_mib": 0.0, "actors": 0.0}
     children = [] if process.returncode else psutil.Process(process.pid).children(recursive=True)
     for child in children:
         try:
@@ -82,11 +82,11 @@ def _watch(process: subprocess.Popen[bytes], run_dir: Path, total: int) -> dict[
         except (psutil.NoSuchProcess, psutil.AccessDenied):
             continue
         if "services.learner" in command:
-            largest["learner_pss_mib"] = max(largest["learner_pss_mib"], pss)
+            found["learner_pss_mib"] += pss
         if "ray::RolloutActor" in command:
-            largest["actor_pss_mib"] = max(largest["actor_pss_mib"], pss)
-            largest["actors"] += 1
-    return largest
+            found["actor_pss_mib"] = max(found["actor_pss_mib"], pss)
+            found["actors"] += 1
+    return found
 
 
 def _rate(rows: list[dict[str, str]]) -> float:

@@ -57,6 +57,12 @@ class DivergedError(LiirError):
     exit_code = 7
 
 
+class ComputeError(LiirError):
+    """The process that computes learner steps died; the last saved state is there."""
+
+    exit_code = 8
+
+
 class DiskFullError(StorageError):
     """There is no room for what should be written; later there may be."""
 

@@ -3,10 +3,19 @@
 Counters of actors reach the learner as deltas on their streams and are exposed there.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 import structlog
-from prometheus_client import REGISTRY, CollectorRegistry, Counter, Gauge, Histogram, start_http_server
+from prometheus_client import (
+    REGISTRY,
+    CollectorRegistry,
+    Counter,
+    Gauge,
+    Histogram,
+    ProcessCollector,
+    start_http_server,
+)
 
 from liir_common.errors import ConfigError
 
@@ -103,6 +112,16 @@ EVALUATED_EPISODE = EVALUATOR.gauge(
 
 for _reason in ("left", "timeout"):  # a rate wants the zero before the first
     TICKETS_REISSUED.labels(_reason)
+
+
+@contextmanager
+def process_exposed(registry: CollectorRegistry, prefix: str, pid: int) -> Iterator[None]:
+    """Expose the standard metrics of another process, too, as PREFIX_process_*."""
+    collector = ProcessCollector(prefix, lambda: pid, registry=registry)
+    try:
+        yield
+    finally:
+        registry.unregister(collector)
 
 
 def serve(registry: CollectorRegistry, host: str, port: int, setting: str) -> int:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from liir_common import seeds
 
+Array = NDArray[Any]
 FloatArray = NDArray[np.float32]
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int16]

@@ -273,6 +273,7 @@ def build() -> dashboard.Dashboard:
                 "Resident, per process; of the actors the sum of their peaks, shared pages counted by each.",
                 "bytes",
                 ("process_resident_memory_bytes", "{{job}}"),
+                ("compute_process_resident_memory_bytes", "{{job}}, computing"),
                 ("liir_actor_peak_memory_bytes", "all actors, peak"),
             ).min(0),
             series(
@@ -280,6 +281,7 @@ def build() -> dashboard.Dashboard:
                 "Cores in use, per process.",
                 "short",
                 ("rate(process_cpu_seconds_total[$__rate_interval])", "{{job}}"),
+                ("rate(compute_process_cpu_seconds_total[$__rate_interval])", "{{job}}, computing"),
             ).min(0),
         ],
     }

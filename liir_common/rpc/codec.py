@@ -18,6 +18,7 @@ from liir_common.rollout.playable import check_playable
 from liir_common.rpc.gen.liir.v1 import rollout_pb2, tensor_pb2
 from liir_common.types import (
     TRAJECTORY_ARRAYS,
+    Array,
     EnvSpec,
     Exploration,
     Ticket,
@@ -25,8 +26,6 @@ from liir_common.types import (
     Weights,
     expected_shape,
 )
-
-Array = NDArray[np.generic]
 
 _DTYPES = {
     tensor_pb2.DTYPE_FLOAT32: np.dtype("<f4"),
@@ -214,7 +213,7 @@ def decode_trajectory(message: rollout_pb2.Trajectory, spec: EnvSpec) -> Traject
         terminated=message.terminated,
         truncated=message.truncated,
         info=dict(zip(spec.info_keys, message.info, strict=True)),
-        **arrays,  # type: ignore[arg-type]
+        **arrays,
     )
     check_playable(trajectory, spec)
     return trajectory

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import faulthandler
 import os
 import time
 from collections import Counter
@@ -24,6 +25,8 @@ from services.actor.rollout_actor import RolloutActor
 log = structlog.get_logger()
 
 _POLL_S, _POLL_WHILE_STARTING_S = 1.0, 0.1
+_RAY_START_S = 180.0
+"""Ray that has not started by then never will: a machine that slept meanwhile leaves it waiting for itself."""
 _QUICK_DEATH_S = 10.0
 """An actor that dies sooner is started again more and more slowly."""
 
@@ -165,11 +168,12 @@ class Fleet:
 
 
 def start_ray(config: ActorsConfig) -> None:
-    """Join the configured Ray cluster, or start one on this machine.
+    """Join the configured Ray cluster, or start one on this machine; ends the process if that hangs.
 
     Raises:
         LiirError: the cluster cannot be reached.
     """
+    faulthandler.dump_traceback_later(_RAY_START_S, exit=True)
     # Ray decides by itself when this is unset, and writes a token into the home folder.
     os.environ.setdefault("RAY_AUTH_MODE", "disabled")
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
@@ -183,3 +187,5 @@ def start_ray(config: ActorsConfig) -> None:
         raise LiirError(
             f"cannot start or join Ray at {config.ray_address or 'this machine'}: {error}"
         ) from None
+    finally:
+        faulthandler.cancel_dump_traceback_later()

@@ -15,7 +15,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from liir_common.config import AlgorithmConfig
 from liir_common.types import Batch, EnvSpec, Trajectory
 from services.learner.algorithms import make_algorithm
-from services.learner.algorithms.runtime import set_up_process
+from services.learner.memory import keep_memory
 
 Layout = tuple[tuple[int, ...], tuple[int, ...]]
 """Sizes and strides of a matrix"""
@@ -49,9 +49,10 @@ def bench_learner(
         recorded.update(batch)
     flops = sum(_flops(a, b) * times for (a, b), times in products.seen.items())
     before = torch.get_num_threads()
+    keep_memory()
     results = {}
     for count in threads:
-        set_up_process(count)
+        torch.set_num_threads(count)
         update, cpu = _median_seconds(lambda: learner.update(batch), repeats)
         floor = sum(_product_seconds(a, b, repeats) * times for (a, b), times in products.seen.items())
         square: Layout = ((1024, 1024), (1024, 1))

@@ -15,7 +15,6 @@ from statistics import median
 from typing import Any
 
 import grpc
-import torch
 
 from liir_common import config
 from liir_common.build import build
@@ -27,10 +26,10 @@ from liir_common.rpc.gen.liir.v1 import rollout_pb2, rollout_pb2_grpc
 from liir_common.rpc.requests import Outgoing, gather, put_together
 from liir_common.rpc.server import Server
 from liir_common.types import Exploration, Ticket, Trajectory, Weights
-from services.learner.algorithms import make_algorithm
-from services.learner.algorithms.runtime import set_up_process
 from services.learner.bench import synthetic_batch
+from services.learner.compute import Compute
 from services.learner.intake import Opening
+from services.learner.memory import keep_memory
 from services.learner.rollout_service import RolloutService
 
 _AHEAD = 8
@@ -92,7 +91,7 @@ def bench_wire(map_name: str, streams: int = 4, batches: int = 40, repeats: int 
     """Medians over `repeats` of the rate and of this process's CPU time per episode, as fast as they come."""
     settings = config.load(None, [f"env.map={map_name}", "training.lag=1"])
     per_repeat = batches * settings.training.batch_episodes
-    set_up_process(1)
+    keep_memory()
 
     async def measure() -> tuple[list[float], list[float]]:
         rates, costs = [], []
@@ -153,24 +152,24 @@ def bench_policy(map_name: str, streams: int = 32, repeats: int = 100) -> dict[s
 def bench_beside(
     map_name: str, rate: float = 300.0, streams: int = 4, seconds: float = 20.0
 ) -> dict[str, Any]:
-    """What learner steps of one thread lose while the same process takes in `rate` episodes per second."""
-    settings = config.load(None, [f"env.map={map_name}", "training.lag=1"])
-    set_up_process(1)
+    """What learner steps of one thread lose while the learner takes in `rate` episodes per second."""
+    settings = config.load(
+        None, [f"env.map={map_name}", "training.lag=1", "learner.device=cpu", "learner.threads=1"]
+    )
+    keep_memory()
     spec = env_spec(settings.env)
-    learner = make_algorithm(spec, settings.algorithm, 0, torch.device("cpu"))
     batch = synthetic_batch(spec, settings.training.batch_episodes, 25, seed=0)
     period = settings.training.batch_episodes / rate
 
-    def learn(stop: threading.Event, steps: list[float]) -> None:
-        set_up_process(1)  # threads are counted for each thread that asks
+    def learn(learner: Compute, stop: threading.Event, steps: list[float]) -> None:
         while not stop.is_set() or len(steps) < 2:  # the first is the warm-up
             begin = time.perf_counter()
             learner.update(batch)
             steps.append(time.perf_counter() - begin)
 
-    async def measure(intake: _Intake, busy: bool) -> float:
+    async def measure(learner: Compute, intake: _Intake, busy: bool) -> float:
         stop, steps = threading.Event(), list[float]()
-        thread = threading.Thread(target=learn, args=(stop, steps))
+        thread = threading.Thread(target=learn, args=(learner, stop, steps))
         thread.start()
         begin = time.perf_counter()
         while time.perf_counter() - begin < seconds:
@@ -185,10 +184,11 @@ def bench_beside(
 
     async def compare() -> tuple[list[float], list[float]]:
         alone, beside = [], []
-        async with _intake(settings, streams, _tickets(settings)) as intake:
-            for _ in range(3):  # in turns, for a machine that others use
-                alone.append(await measure(intake, busy=False))
-                beside.append(await measure(intake, busy=True))
+        with Compute(spec, settings) as learner:
+            async with _intake(settings, streams, _tickets(settings)) as intake:
+                for _ in range(3):  # in turns, for a machine that others use
+                    alone.append(await measure(learner, intake, busy=False))
+                    beside.append(await measure(learner, intake, busy=True))
         return alone, beside
 
     alone, beside = asyncio.run(compare())

@@ -11,9 +11,9 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-import torch
+import numpy as np
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save
+from safetensors.numpy import load_file, save
 
 from liir_common.errors import CorruptError
 from liir_common.files import check_digest, write_digested
@@ -34,8 +34,8 @@ class ReplayStore:
     def append(self, first: int, frames: Sequence[bytes]) -> None:
         """Keep the episodes from `first` on."""
         if frames:
-            data = torch.frombuffer(bytearray(b"".join(frames)), dtype=torch.uint8)
-            sizes = torch.tensor([len(frame) for frame in frames])
+            data = np.frombuffer(b"".join(frames), np.uint8)
+            sizes = np.array([len(frame) for frame in frames])
             name = f"replay-{first:09d}-{first + len(frames):09d}.safetensors"
             write_digested(self._path / name, save({"frames": data, "sizes": sizes}))
 
@@ -76,11 +76,11 @@ class ReplayStore:
 def _read(path: Path) -> list[bytes]:
     try:
         check_digest(path)
-        tensors = load_file(path)
+        arrays = load_file(path)
     except (SafetensorError, CorruptError) as error:
         raise CorruptError(
             f"{path} cannot be read ({error}); restore it from a backup, or remove all states to train "
             "from the start"
         ) from None
-    parts = tensors["frames"].split_with_sizes(tensors["sizes"].tolist())
-    return [part.numpy().tobytes() for part in parts]
+    parts = np.split(arrays["frames"], arrays["sizes"].cumsum()[:-1])
+    return [part.tobytes() for part in parts]

@@ -23,15 +23,14 @@ from typing import Any
 import structlog
 import yaml
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
-from torch import Tensor
+from safetensors.numpy import save
 
 from liir_common.build import build, git_commit
 from liir_common.checkpoint import CheckpointStore
 from liir_common.config import Config
 from liir_common.errors import ConfigError, CorruptError
 from liir_common.files import Table, check_digest, remove_leftovers, write_atomic, write_digested
-from liir_common.types import EnvSpec
+from liir_common.types import Array, EnvSpec
 from services.learner.replay_store import ReplayStore
 
 log = structlog.get_logger()
@@ -92,12 +91,11 @@ class RunDirectory:
         """Say where this learner listens, for whoever starts the other processes."""
         self._write_json("endpoints.json", {**endpoints, "pid": os.getpid()})
 
-    def save_state(self, counters: Counters, tensors: Mapping[str, Tensor], notes: Mapping[str, Any]) -> None:
+    def save_state(self, counters: Counters, arrays: Mapping[str, Array], notes: Mapping[str, Any]) -> None:
         """Keep what the learner needs to go on after `counters.learner_step`, and the state before it."""
         metadata = {"counters": json.dumps(asdict(counters)), "notes": json.dumps(notes)}
-        contiguous = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
         name = f"state-{counters.learner_step:09d}.safetensors"
-        new = write_digested(self.path / "state" / name, save(contiguous, metadata))
+        new = write_digested(self.path / "state" / name, save(dict(arrays), metadata))
         before = [path for path in self._state_paths() if _step(path) < counters.learner_step]
         # A later one is damaged, or the run would have gone on from it.
         for path in {*self._state_paths()} - {new, *before[-1:]}:
@@ -109,7 +107,7 @@ class RunDirectory:
         paths = self._state_paths()
         return _step(paths[0]) if paths else 0
 
-    def load_state(self) -> tuple[Counters, dict[str, Tensor], dict[str, Any]] | None:
+    def load_state(self) -> tuple[Counters, dict[str, Array], dict[str, Any]] | None:
         """The newest state that can be read, or nothing if the run never saved one.
 
         Raises:
@@ -119,11 +117,11 @@ class RunDirectory:
         for path in reversed(paths):
             try:
                 check_digest(path)
-                with safe_open(path, framework="pt") as file:
+                with safe_open(path, framework="np") as file:
                     metadata = file.metadata()
-                    tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+                    arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
                 counters = Counters(**json.loads(metadata["counters"]))
-                return counters, tensors, json.loads(metadata["notes"])
+                return counters, arrays, json.loads(metadata["notes"])
             except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
                 log.error(
                     "a saved state cannot be read; trying the one before", path=str(path), error=str(error)

@@ -1,17 +1,17 @@
-"""The learner process: gRPC on the event loop, training in a thread, one graceful way to end."""
+"""The learner process: gRPC on the event loop, the training loop in a thread, one graceful way to end."""
 
 from __future__ import annotations
 
 import asyncio
 import signal
 from collections.abc import Awaitable, Callable
+from typing import TYPE_CHECKING
 
 import structlog
-import torch
 
-from liir_common import metrics, seeds
+from liir_common import metrics
 from liir_common.config import Config
-from liir_common.errors import ConfigError, storage_explained
+from liir_common.errors import storage_explained
 from liir_common.rpc.gen.liir.v1 import (
     checkpoint_pb2_grpc,
     rollout_pb2_grpc,
@@ -20,14 +20,17 @@ from liir_common.rpc.gen.liir.v1 import (
 )
 from liir_common.rpc.server import Server
 from liir_common.types import EnvSpec, Weights
-from services.learner.algorithms import make_algorithm
-from services.learner.algorithms.runtime import set_up_process
 from services.learner.checkpoint_service import CheckpointService
+from services.learner.compute import Compute
 from services.learner.intake import Opening
+from services.learner.memory import keep_memory
 from services.learner.rollout_service import RolloutService
 from services.learner.run_directory import RunDirectory
 from services.learner.trainer import Trainer
 from services.learner.training_service import TrainingService
+
+if TYPE_CHECKING:  # or torch would come along
+    from services.learner.algorithms import Algorithm
 
 log = structlog.get_logger()
 
@@ -37,23 +40,25 @@ _STOP_GRACE_S = 2.0
 
 async def serve(config: Config, run: RunDirectory, spec: EnvSpec) -> None:
     """Train until the run is complete and its checkpoints are tested, or until asked to stop."""
-    # This thread only serves. With a pool of its own OpenMP would count more threads than cores and put
-    # the trainer's to sleep at every barrier, which doubles the time of an update.
-    set_up_process(threads=1)
-    loop = asyncio.get_running_loop()
+    keep_memory()
     server = Server(
         config.learner.host, config.learner.port, config.security, insecure=config.learner.insecure
     )
     metrics_port = metrics.serve(
         metrics.LEARNER, config.metrics.host, config.learner.metrics_port, "learner.metrics_port"
     )
-    algorithm = make_algorithm(
-        spec, config.algorithm, seeds.derive(config.seed, seeds.LEARNER), device(config.learner.device)
-    )
-    log.info("parameters", **algorithm.parameter_counts())
-    with storage_explained(run.path):
-        run.write_parameters(algorithm.parameter_counts())
+    with (
+        Compute(spec, config) as algorithm,
+        metrics.process_exposed(metrics.LEARNER, "compute", algorithm.pid),
+    ):
+        log.info("parameters", **algorithm.parameter_counts())
+        with storage_explained(run.path):
+            run.write_parameters(algorithm.parameter_counts())
+        await _train(run, algorithm, server, f"{config.metrics.host}:{metrics_port}")
 
+
+async def _train(run: RunDirectory, algorithm: Algorithm, server: Server, metrics_address: str) -> None:
+    config, loop = run.config, asyncio.get_running_loop()
     on_loop = _OnLoop(loop)
 
     def publish(opening: Opening, weights: Weights) -> None:
@@ -65,7 +70,7 @@ async def serve(config: Config, run: RunDirectory, spec: EnvSpec) -> None:
     with storage_explained(run.path):
         trainer = Trainer(run, algorithm, publish, frozen)
     metrics.BATCHES_WAITING.set_function(trainer.batches.qsize)
-    rollouts = RolloutService(config, spec, trainer.next_batch, trainer.batches)
+    rollouts = RolloutService(config, run.spec, trainer.next_batch, trainer.batches)
     checkpoints = CheckpointService(run)
     stopping = asyncio.Event()
 
@@ -83,19 +88,19 @@ async def serve(config: Config, run: RunDirectory, spec: EnvSpec) -> None:
 
     await server.start()
     with storage_explained(run.path):
-        run.write_endpoints(
-            {"address": server.local_address, "metrics": f"{config.metrics.host}:{metrics_port}"}
-        )
+        run.write_endpoints({"address": server.local_address, "metrics": metrics_address})
     log.info("serving", address=f"{config.learner.host}:{server.port}", run=str(run.path))
     expiry = asyncio.create_task(rollouts.expire_tickets())
+    learning = asyncio.create_task(asyncio.to_thread(trainer.run))
     try:
-        await _first_of(asyncio.to_thread(trainer.run), expiry, on_loop.failure)
+        await _first_of(learning, expiry, on_loop.failure)
         if trainer.complete and config.evaluation.enabled and not stopping.is_set():
             trainer.progress.phase = training_pb2.PHASE_EVALUATING
             await _first_of(checkpoints.wait_all_evaluated(), stopping.wait(), expiry, on_loop.failure)
     finally:
         trainer.stop()
         expiry.cancel()
+        await asyncio.wait([learning])  # which saves the state, with the algorithm that is still there
         await _leave(server, trainer, rollouts, checkpoints)
 
 
@@ -137,18 +142,3 @@ async def _first_of(*awaitables: Awaitable[object]) -> None:
     done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
     for task in done:
         task.result()
-
-
-def device(name: str) -> torch.device:
-    """The device to train on: "auto" takes a GPU when there is one.
-
-    Raises:
-        ConfigError: "cuda", and torch sees none.
-    """
-    if name == "cuda" and not torch.cuda.is_available():
-        raise ConfigError(
-            "learner.device: wanted a CUDA device, torch sees none; set auto or cpu, or mend the driver"
-        )
-    if name == "auto":
-        name = "cuda" if torch.cuda.is_available() else "cpu"
-    return torch.device(name)

@@ -11,23 +11,22 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import structlog
-import torch
-from torch import Tensor
 
 from liir_common import metrics
 from liir_common.build import git_commit
 from liir_common.checkpoint import Manifest, pack
 from liir_common.errors import CorruptError, DiskFullError, DivergedError, storage_explained
 from liir_common.rpc.gen.liir.v1 import training_pb2
-from liir_common.types import Batch, Trajectory, Weights
-from services.learner.algorithms import Algorithm
-from services.learner.algorithms.runtime import set_up_process
+from liir_common.types import Array, Batch, Trajectory, Weights
 from services.learner.intake import Opening
 from services.learner.run_directory import Counters, RunDirectory
+
+if TYPE_CHECKING:  # or torch would come along, which is for the process that computes
+    from services.learner.algorithms import Algorithm
 
 log = structlog.get_logger()
 
@@ -117,7 +116,6 @@ class Trainer:
             StorageError: the run directory cannot be written to; while it is only full, this waits for room
                 until told to stop.
         """
-        set_up_process(self.config.learner.threads)
         for opening, weights in () if self.complete else self._openings:
             self._publish(opening, weights)
         while not (self._stopping.is_set() or self.complete) and self._step():
@@ -154,8 +152,8 @@ class Trainer:
                 self._save()
         return True
 
-    def _open(self, counters: Counters) -> None:
-        """Let the actors play a batch with the policy of the step that ends at `counters`.
+    def _open(self, counters: Counters, weights: Weights) -> None:
+        """Let the actors play a batch with `weights`, the policy of the step that ends at `counters`.
 
         If the run is complete then, the opening is kept only, so that a run resumed with more steps goes on
         as if never ended.
@@ -163,7 +161,6 @@ class Trainer:
         epsilon = self.config.algorithm.exploration.epsilon(counters.env_steps)
         batch = counters.learner_step + self.config.training.lag
         opening = Opening(batch, counters.learner_step, epsilon)
-        weights = self.algorithm.policy()
         self._openings.append((opening, weights))
         if not self._completes(counters):
             self._publish(opening, weights)
@@ -233,12 +230,11 @@ class Trainer:
     def _save(self) -> None:
         """Keep everything the next learner step depends on."""
         self._save_replay()
-        tensors = {f"algorithm.{name}": tensor for name, tensor in self.algorithm.state().items()}
+        arrays: dict[str, Array] = {f"algorithm.{name}": a for name, a in self.algorithm.state().items()}
         for opening, weights in self._openings:
-            for name, array in weights.items():
-                tensors[f"opening.{opening.batch}.{name}"] = torch.from_numpy(array)
+            arrays |= {f"opening.{opening.batch}.{name}": array for name, array in weights.items()}
         notes = {"openings": [asdict(opening) for opening, _ in self._openings]}
-        self._store(lambda: self.run_directory.save_state(self.progress.counters, tensors, notes))
+        self._store(lambda: self.run_directory.save_state(self.progress.counters, arrays, notes))
 
     def _save_replay(self) -> None:
         """Append the new episodes, before the state that counts them; drop those that no kept state needs."""
@@ -286,26 +282,25 @@ class Trainer:
                 epsilon = self.config.algorithm.exploration.epsilon(0)
                 self._openings.append((Opening(batch, 0, epsilon), self.algorithm.policy()))
         else:
-            _, tensors, notes = saved
+            _, arrays, notes = saved
             try:
-                self.algorithm.load_state(_section(tensors, "algorithm."))
+                self.algorithm.load_state(_section(arrays, "algorithm."))
             except ValueError as error:
                 raise CorruptError(
                     f"the state of step {counters.learner_step} fits no {self.config.algorithm.name} of this "
                     f"build: {error}; resume with the build that wrote it"
                 ) from None
             for fields in notes["openings"]:
-                weights = _section(tensors, f"opening.{fields['batch']}.")
-                numpy_weights = {name: tensor.numpy() for name, tensor in weights.items()}
-                self._openings.append((Opening(**fields), numpy_weights))
+                weights = _section(arrays, f"opening.{fields['batch']}.")
+                self._openings.append((Opening(**fields), weights))
             log.info("resumed", **asdict(counters))
         self.progress.counters = counters
         self.run_directory.metrics.keep("learner_step", counters.learner_step)
         self._show_progress()
 
 
-def _section(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    return {name.removeprefix(prefix): t for name, t in tensors.items() if name.startswith(prefix)}
+def _section(arrays: Mapping[str, Array], prefix: str) -> dict[str, Array]:
+    return {name.removeprefix(prefix): a for name, a in arrays.items() if name.startswith(prefix)}
 
 
 @dataclass

@@ -95,14 +95,18 @@ def kill_driver(process: subprocess.Popen[str], run_dir: Path) -> None:
 
 
 def kill_learner(process: subprocess.Popen[str], run_dir: Path) -> None:
-    service.kill(service.descendants(process, "services.learner")[0])
+    service.kill(service.descendants(process, "services.learner --")[0])
+
+
+def kill_compute(process: subprocess.Popen[str], run_dir: Path) -> None:
+    service.kill(service.descendants(process, "services.learner.compute")[0])
 
 
 def kill_evaluator(process: subprocess.Popen[str], run_dir: Path) -> None:
     service.kill(service.descendants(process, "services.evaluator")[0])
 
 
-@pytest.mark.parametrize("kill", [kill_actor, kill_driver, kill_learner, kill_evaluator])
+@pytest.mark.parametrize("kill", [kill_actor, kill_driver, kill_learner, kill_compute, kill_evaluator])
 def test_a_death_changes_nothing(
     kill: Callable[[subprocess.Popen[str], Path], None], undisturbed: Path, tmp_path: Path
 ) -> None:

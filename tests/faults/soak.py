@@ -31,7 +31,8 @@ SETTINGS = (
     "evaluation.episodes=20",
 )
 PROCESSES = {
-    "learner": "services.learner",
+    "learner": "services.learner --",
+    "compute": "services.learner.compute",
     "driver": "services.actor",
     "evaluator": "services.evaluator",
     "actor": "ray::RolloutActor",

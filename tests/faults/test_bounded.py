@@ -48,9 +48,11 @@ def test_a_learner_a_hundred_times_slower_than_its_actors_does_not_grow(tmp_path
             step = service.learner_step(run_dir)
             service.wait_for(lambda: service.learner_step(run_dir) >= step + 2, "two steps with all actors")
             begin, memory = service.learner_step(run_dir), []
+            processes = [psutil.Process(learner.pid), *psutil.Process(learner.pid).children()]
+            assert len(processes) == 2
             deadline = time.monotonic() + SECONDS
             while time.monotonic() < deadline:
-                memory.append(psutil.Process(learner.pid).memory_info().rss)
+                memory.append(sum(process.memory_info().rss for process in processes))
                 assert training.status().tickets_outstanding <= (LAG + 1) * BATCH
                 # An update opens a batch as soon as it has moved the policy.
                 assert scrape(log)["liir_batches_waiting"] <= LAG + 1

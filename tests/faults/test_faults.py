@@ -18,7 +18,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from liir_common.errors import DiskFullError, UnreachableError
+from liir_common.errors import ComputeError, DiskFullError, UnreachableError
 from tests.e2e import service
 from tests.e2e.test_run import assert_same
 from tests.faults.proxy import Proxy
@@ -45,6 +45,7 @@ PLAN = {
     "pause_actor": 4,
     "kill_evaluator": 6,
     "kill_learner": 5,
+    "kill_compute": 3,
     "stop_learner": 2,
     "pause_learner": 3,
     "kill_driver": 2,
@@ -55,7 +56,7 @@ PLAN = {
 }
 """How often each fault happens; the seed shuffles them."""
 ORDINARY_CODES = {
-    "learner": {-signal.SIGKILL, -signal.SIGTERM, DiskFullError.exit_code},
+    "learner": {-signal.SIGKILL, -signal.SIGTERM, DiskFullError.exit_code, ComputeError.exit_code},
     "evaluator": {-signal.SIGKILL, UnreachableError.exit_code},
 }
 """How an incarnation may fail: killed, asked to end or without room while it started, nobody there."""
@@ -142,6 +143,11 @@ class Faults:
 
     def kill_learner(self) -> None:
         self.process("learner").kill()
+
+    def kill_compute(self) -> None:
+        """The process beside the learner's; the learner cannot do without."""
+        for child in self.process("learner").children():
+            child.kill()
 
     def stop_learner(self) -> None:
         """It saves, says goodbye and ends with 0, which the supervisor takes for the run's end."""

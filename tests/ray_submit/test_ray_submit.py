@@ -150,7 +150,7 @@ def test_up_submit_a_worker_lost_and_back_finish_down(cluster: Cluster, tmp_path
 
     # The learner and the evaluator are children of Ray actors, the rollout actors sit on both machines.
     wait_for(lambda: running() > 0, "the first learner step", 600)
-    assert processes(cluster.head, "services.learner") == 1
+    assert processes(cluster.head, "services.learner --") == 1
     assert processes(cluster.head, "ray::Host") + processes(cluster.worker, "ray::Host") == 2
     wait_for(lambda: actors(cluster) == (ACTORS // 2, ACTORS // 2), "actors on both machines")
     wait_for(lambda: (run_dir / "evaluations.csv").exists(), "the first evaluation")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import socket
+import subprocess
+import sys
 from unittest.mock import Mock
 
 import pytest
@@ -10,6 +12,16 @@ import pytest
 from liir_common import config
 from liir_common.errors import ConfigError
 from services.actor import __main__ as command
+
+
+HANGING = """
+import time, ray
+from liir_common import config
+from services.actor import driver
+driver._RAY_START_S = 0.5
+ray.init = lambda **_: time.sleep(600)
+driver.start_ray(config.load().actors)
+"""
 
 
 @pytest.fixture
@@ -45,3 +57,9 @@ def test_a_busy_metrics_port_is_an_error_that_names_its_key(
     assert caught.value.code == ConfigError.exit_code
     assert "--set actors.metrics_port=N" in capfd.readouterr().err
     seen.Fleet.assert_not_called()
+
+
+def test_ray_that_never_starts_ends_the_process_and_says_where() -> None:
+    done = subprocess.run([sys.executable, "-c", HANGING], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 1
+    assert "in start_ray" in done.stderr

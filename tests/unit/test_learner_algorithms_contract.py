@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 
 from liir_common.config import METHOD_PRESETS, PRESETS, AlgorithmConfig, EnvConfig
 from liir_common.rollout.play import make_player
-from liir_common.types import Batch, EnvSpec, Ticket, policy_shapes
+from liir_common.types import Batch, EnvSpec, Ticket, Weights, policy_shapes
 from services.learner.algorithms import Algorithm, gru, gru_eager, make_algorithm
 from services.learner.algorithms.networks import views
 from services.learner.bench import bench_learner, synthetic_batch
+from tests.states import load_state, state_of
 
 # On products this small a second thread only waits, and it spins while it does.
 torch.set_num_threads(1)
@@ -59,7 +59,7 @@ def copy(source: Algorithm, into: Algorithm) -> None:
 
 
 def assert_equal_states(a: Algorithm, b: Algorithm, *, but_for: str = "nothing") -> None:
-    x, y = ({k: v for k, v in s.items() if not k.startswith(but_for)} for s in (a.state(), b.state()))
+    x, y = ({k: v for k, v in s.items() if not k.startswith(but_for)} for s in (state_of(a), state_of(b)))
     assert x.keys() == y.keys()
     assert [name for name in x if not torch.equal(x[name], y[name])] == []
 
@@ -67,10 +67,10 @@ def assert_equal_states(a: Algorithm, b: Algorithm, *, but_for: str = "nothing")
 @pytest.mark.parametrize("method", METHODS)
 def test_the_policy_is_announced_once_and_stays_as_it_was_then(method: str) -> None:
     algorithm = make(method)
-    announced: list[dict[str, NDArray[np.float32]]] = []
+    announced: list[Weights] = []
     for seed in range(3):
         before = algorithm.policy()
-        algorithm.update(batch_of(seed), lambda: announced.append(algorithm.policy()))
+        algorithm.update(batch_of(seed), announced.append)
         after = algorithm.policy()
         assert len(announced) == seed + 1
         assert [name for name in after if not np.array_equal(announced[-1][name], after[name])] == []
@@ -82,7 +82,7 @@ def test_going_on_from_a_saved_state_equals_never_having_stopped(method: str) ->
     straight = make(method)
     for seed in range(4):
         straight.update(batch_of(seed))
-    saved = straight.state()
+    saved = state_of(straight)
     resumed = make(method, seed=6)
     for seed in range(2):
         resumed.update(batch_of(seed))
@@ -91,14 +91,14 @@ def test_going_on_from_a_saved_state_equals_never_having_stopped(method: str) ->
     for seed in range(4, 8):
         assert straight.update(batch_of(seed)) == resumed.update(batch_of(seed))
         assert_equal_states(straight, resumed)
-    assert any(not torch.equal(saved[name], value) for name, value in straight.state().items())
+    assert any(not torch.equal(saved[name], value) for name, value in state_of(straight).items())
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_a_saved_state_is_a_copy(method: str) -> None:
     algorithm = make(method)
     algorithm.update(batch_of(0))
-    saved = algorithm.state()
+    saved = state_of(algorithm)
     kept = {name: value.clone() for name, value in saved.items()}
     algorithm.update(batch_of(1))
     assert all(torch.equal(saved[name], kept[name]) for name in saved)
@@ -106,22 +106,22 @@ def test_a_saved_state_is_a_copy(method: str) -> None:
 
 def test_states_of_something_else_are_refused() -> None:
     algorithm = make("liir")
-    before = algorithm.state()
+    before = state_of(algorithm)
     other_shape = before | {"phi.parameters": torch.zeros(3)}
     without = {name: value for name, value in before.items() if name != "eta.optimizer.mean"}
     other_type = before | {"phi.parameters": before["phi.parameters"].double()}
     fresh = make("liir fresh")
     fresh.update(batch_of(0))
     for state, message in [
-        (make("central_v").state(), "missing .*eta.parameters"),
+        (state_of(make("central_v")), "missing .*eta.parameters"),
         (without, r"missing \['eta.optimizer.mean'\]"),
         (other_shape, r"phi.parameters wants .* got \(\(3,\)"),
         (other_type, "float64"),
-        (fresh.state(), "unknown .*pending"),
+        (state_of(fresh), "unknown .*pending"),
     ]:
         with pytest.raises(ValueError, match=message):
-            algorithm.load_state(state)
-    after = algorithm.state()
+            load_state(algorithm, state)
+    after = state_of(algorithm)
     assert all(torch.equal(before[name], after[name]) for name in before)
 
 
@@ -202,9 +202,11 @@ def test_the_dead_still_teach_the_values(method: str) -> None:
     other, base = make(method), make(method)
     base.update(batch)
     other.update(replace(batch, reward=late))
-    names = [name for name in ("phi.parameters", "varphi.parameters", "q.parameters") if name in base.state()]
+    names = [
+        name for name in ("phi.parameters", "varphi.parameters", "q.parameters") if name in state_of(base)
+    ]
     assert names
-    assert not any(torch.equal(base.state()[name], other.state()[name]) for name in names)
+    assert not any(torch.equal(state_of(base)[name], state_of(other)[name]) for name in names)
 
 
 @pytest.mark.parametrize(
@@ -215,7 +217,7 @@ def test_targets_are_copied_at_every_interval(method: str, part: str) -> None:
     followed = []
     for seed in range(7):
         algorithm.update(batch_of(seed))
-        state = algorithm.state()
+        state = state_of(algorithm)
         followed.append(torch.equal(state[f"{part}.target"], state[f"{part}.parameters"]))
     assert followed == [False, False, True, False, False, True, False]
 
@@ -237,11 +239,11 @@ def test_equal_seeds_learn_equally_and_leave_global_randomness_alone(method: str
 def test_an_update_without_compiled_recurrences_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     """A GPU has none of them."""
     compiled, eager = make("liir"), make("liir")
-    before = compiled.state()
+    before = state_of(compiled)
     figures = compiled.update(batch_of(0))
     monkeypatch.setattr(gru, "_recurrences", lambda tensor: gru_eager)
     assert eager.update(batch_of(0)) == pytest.approx(figures, rel=1e-4)
-    wanted, got = compiled.state(), eager.state()
+    wanted, got = state_of(compiled), state_of(eager)
     assert not torch.equal(got["policy.parameters"], wanted["policy.parameters"]), "both went the same way"
     for name, value in wanted.items():
         assert (got[name] - value).double().norm() <= 1e-4 * (value - before[name]).double().norm(), name
@@ -263,10 +265,10 @@ def test_policy_has_the_agreed_names_shapes_and_type(method: str) -> None:
 def test_a_refused_batch_changes_nothing(method: str) -> None:
     algorithm = make(method)
     algorithm.update(batch_of(0))
-    before = algorithm.state()
+    before = state_of(algorithm)
     with pytest.raises(ValueError, match="mask without any"):
         algorithm.update(replace(batch_of(1), mask=np.zeros_like(batch_of(1).mask)))
-    after = algorithm.state()
+    after = state_of(algorithm)
     assert all(torch.equal(before[name], after[name]) for name in before)
     assert algorithm.replay is None or algorithm.replay.total == 6
 
@@ -295,11 +297,11 @@ def test_a_single_step_on_its_own_episodes_clips_nothing() -> None:
 def test_a_saturated_policy_is_seen_in_its_hidden_std(method: str) -> None:
     algorithm = make(method)
     assert algorithm.update(batch_of(0))["policy_hidden_std"] > 0.03
-    state = algorithm.state()
+    state = state_of(algorithm)
     _, z, n = views(state["policy.parameters"], policy_shapes(SPEC, 8))["gru.bias_ih"].chunk(3)
     z.fill_(-50)
     n.fill_(50)  # h = tanh(n) from the first step on
-    algorithm.load_state(state)
+    load_state(algorithm, state)
     assert algorithm.update(batch_of(1))["policy_hidden_std"] < 0.001
 
 
@@ -330,7 +332,7 @@ def test_parameters_meet_the_budget(battle: str, name: str) -> None:
     beside_theta = [size for part, size in counts.items() if part not in ("theta", "budget")]
     assert sum(beside_theta) == pytest.approx(budget, rel=0 if name == "coma" else 0.01)
     assert sum(w.size for w in algorithm.intrinsic().values()) == counts.get("eta", 0)
-    trained = [v.numel() for key, v in algorithm.state().items() if key.endswith(".parameters")]
+    trained = [v.numel() for key, v in state_of(algorithm).items() if key.endswith(".parameters")]
     assert sorted(trained) == sorted([theta, *beside_theta])
 
 

@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from liir_common.errors import ConfigError
-from services.learner.service import _first_of, _OnLoop, device
+from services.learner.compute.__main__ import device
+from services.learner.service import _first_of, _OnLoop
 
 
 async def fails() -> None:

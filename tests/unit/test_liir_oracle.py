@@ -17,6 +17,7 @@ from liir_common.config import AlgorithmConfig
 from liir_common.types import Batch, EnvSpec, policy_shapes
 from services.learner.algorithms import Algorithm, make_algorithm
 from services.learner.bench import synthetic_batch
+from tests.states import load_state, state_of
 
 # On products this small a second thread only waits, and it spins while it does.
 torch.set_num_threads(1)
@@ -317,7 +318,7 @@ def warmed(config: AlgorithmConfig) -> tuple[Algorithm, State]:
     algorithm = make_algorithm(SPEC, config, 5, CPU, torch.float64)
     for seed in range(4):
         algorithm.update(batch_of(seed, seed))
-    return algorithm, algorithm.state()
+    return algorithm, state_of(algorithm)
 
 
 def fitted(state: State, name: str, returns: Tensor, batch: Batch, config: AlgorithmConfig) -> Tensor:
@@ -357,7 +358,7 @@ def test_update_equals_differentiating_through_the_inner_step(case: str) -> None
     batch = replace(batch, reward=batch.reward - np.float32(0.3) * batch.filled)
     wanted = reference(before, batch, config)
     metrics = algorithm.update(batch)
-    after = algorithm.state()
+    after = state_of(algorithm)
     moved = wanted.theta - before["policy.parameters"]
     close(after["policy.parameters"] - before["policy.parameters"], moved, 1e-9)
     close(eta_gradient(before, after), wanted.eta_gradient, 1e-9)
@@ -380,7 +381,7 @@ def test_meta_gradient_equals_central_differences_of_eta(case: str) -> None:
     _, a_ex = extrinsic(before, batch, config)
     wanted = reference(before, batch, config)
     algorithm.update(batch)
-    gradient = eta_gradient(before, algorithm.state())
+    gradient = eta_gradient(before, state_of(algorithm))
     _, a_proxy = proxy(before["eta.parameters"], before, batch, config)
     last = frozen_step(before, batch, a_proxy, config)
 
@@ -425,9 +426,9 @@ def test_fresh_samples_judge_the_step_one_batch_later() -> None:
     algorithm, before = warmed(config)
     first, second = batch_of(9, 9), batch_of(10, 10)
     algorithm.update(first)
-    between = algorithm.state()
+    between = state_of(algorithm)
     algorithm.update(second)
-    after = algorithm.state()
+    after = state_of(algorithm)
 
     # The step on `first` was made with the η that `first` had just improved, and with the critics before it.
     eta = between["eta.parameters"].clone().requires_grad_()
@@ -440,9 +441,9 @@ def test_fresh_samples_judge_the_step_one_batch_later() -> None:
 
 def test_nothing_is_judged_before_fresh_samples_came() -> None:
     algorithm = make_algorithm(SPEC, config_of({"outer_samples": "fresh"}), 5, CPU, torch.float64)
-    before = algorithm.state()
+    before = state_of(algorithm)
     metrics = algorithm.update(batch_of(0))
-    assert torch.equal(algorithm.state()["eta.parameters"], before["eta.parameters"])
+    assert torch.equal(state_of(algorithm)["eta.parameters"], before["eta.parameters"])
     assert "eta_gradient_norm" not in metrics
 
 
@@ -451,9 +452,9 @@ def test_central_difference_comes_close_to_forward_mode(dtype: torch.dtype, rtol
     gradients = []
     for mode in ("jvp", "difference"):
         algorithm = make_algorithm(SPEC, config_of({"meta_gradient": mode}), 5, CPU, dtype)
-        before = algorithm.state()
+        before = state_of(algorithm)
         algorithm.update(batch_of(9))
-        gradients.append(eta_gradient(before, algorithm.state()))
+        gradients.append(eta_gradient(before, state_of(algorithm)))
     assert not torch.equal(*gradients)
     close(gradients[1], gradients[0], rtol)
 
@@ -461,10 +462,10 @@ def test_central_difference_comes_close_to_forward_mode(dtype: torch.dtype, rtol
 @pytest.mark.parametrize("control", [{"lambda": 0.0}, {"freeze_eta": True}])
 def test_controls_leave_the_intrinsic_reward_alone(control: dict[str, object]) -> None:
     algorithm = make_algorithm(SPEC, config_of(control), 5, CPU, torch.float64)
-    before = algorithm.state()
+    before = state_of(algorithm)
     for seed in range(3):
         algorithm.update(batch_of(seed, seed))
-    after = algorithm.state()
+    after = state_of(algorithm)
     assert torch.equal(after["eta.parameters"], before["eta.parameters"])
     assert not torch.equal(after["policy.parameters"], before["policy.parameters"])
 
@@ -472,17 +473,17 @@ def test_controls_leave_the_intrinsic_reward_alone(control: dict[str, object]) -
 def test_without_lambda_the_policy_learns_as_if_there_were_no_intrinsic_reward() -> None:
     config = config_of({"lambda": 0.0})
     algorithm, other = (make_algorithm(SPEC, config, 5, CPU, torch.float64) for _ in range(2))
-    state = other.state()
-    other.load_state(state | {"eta.parameters": torch.randn_like(state["eta.parameters"])})
+    state = state_of(other)
+    load_state(other, state | {"eta.parameters": torch.randn_like(state["eta.parameters"])})
     for seed in range(2):
         for learner in (algorithm, other):
             learner.update(batch_of(seed, seed))
-    assert equal_but_for_eta(algorithm.state(), other.state())
+    assert equal_but_for_eta(state_of(algorithm), state_of(other))
 
-    before, batch = algorithm.state(), batch_of(9, 9)
+    before, batch = state_of(algorithm), batch_of(9, 9)
     _, theta = inner_steps(torch.zeros_like(before["eta.parameters"]), before, batch, config)
     algorithm.update(batch)
-    close(algorithm.state()["policy.parameters"], theta.detach(), 1e-12)
+    close(state_of(algorithm)["policy.parameters"], theta.detach(), 1e-12)
 
 
 def equal_but_for_eta(a: State, b: State) -> bool:

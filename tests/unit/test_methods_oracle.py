@@ -20,6 +20,7 @@ from services.learner.algorithms.iql import Independent
 from services.learner.algorithms.networks import count, views
 from services.learner.algorithms.qmix import MonotonicMixer
 from services.learner.algorithms.vdn import Sum
+from tests.states import state_of
 from tests.unit.test_liir_oracle import (
     BETA_1,
     BETA_2,
@@ -77,7 +78,7 @@ def warmed(case: str, settings: dict[str, object]) -> tuple[Algorithm, State, Al
     algorithm = make_algorithm(SPEC, config, 5, CPU, torch.float64)
     for seed in range(4):
         algorithm.update(batch_of(seed, seed))
-    return algorithm, algorithm.state(), config
+    return algorithm, state_of(algorithm), config
 
 
 def played(batch: Batch) -> list[tuple[int, int]]:
@@ -208,7 +209,7 @@ def test_actor_critic_update_equals_the_formulas(case: str) -> None:
     batch = batch_of(9, 9)
     theta, varphi = reference(before, batch, config)
     metrics = algorithm.update(batch)
-    after = algorithm.state()
+    after = state_of(algorithm)
     for key, wanted in [("policy.parameters", theta), ("varphi.parameters", varphi)]:
         close(after[key] - before[key], wanted - before[key], 1e-9)
     assert (metrics["clip_fraction"] > 0.01) == (config.policy_epochs > 1)
@@ -298,7 +299,7 @@ def test_value_based_update_equals_the_formulas(case: str) -> None:
     renamed = {f"policy.optimizer.{key}": before[f"q.optimizer.{key}"] for key in ("square", "mean", "steps")}
     wanted = Preconditioner(renamed, config)(-gradient)
     metrics = algorithm.update(batch)
-    close(algorithm.state()["q.parameters"] - before["q.parameters"], wanted, 1e-9)
+    close(state_of(algorithm)["q.parameters"] - before["q.parameters"], wanted, 1e-9)
     assert metrics["q_loss"] == pytest.approx(loss.item(), rel=1e-12)
     assert (metrics["policy_gradient_norm"] > config.policy_optimizer.clip) == ("clipped" in case)
 

@@ -16,7 +16,7 @@ from liir_common import metrics
 ROOT = Path(__file__).parents[2]
 DASHBOARD = ROOT / "deploy/grafana/dashboards/liir.json"
 RULES = ROOT / "deploy/prometheus/rules.yml"
-NAME = re.compile(r"\b(?:liir|process|python)_\w+")
+NAME = re.compile(r"\b(?:liir|compute|process|python)_\w+")
 UNIT_SUFFIXES = {"seconds": "s", "bytes": "bytes", "steps": "steps", "versions": "versions"}
 
 
@@ -73,7 +73,16 @@ def test_units_are_given_and_agree_with_the_names() -> None:
 def test_every_metric_is_drawn_and_everything_drawn_exists() -> None:
     ours = {name for name in drawn() if name.startswith("liir_")}
     assert ours == set(defined())
-    assert drawn() - ours <= {"process_resident_memory_bytes", "process_cpu_seconds_total"}
+    standard = {"process_resident_memory_bytes", "process_cpu_seconds_total"}
+    assert drawn() - ours == standard | {f"compute_{name}" for name in standard}
+
+
+def test_another_process_can_be_exposed_beside_the_own() -> None:
+    registry = metrics.ProcessRegistry()
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as other:
+        with metrics.process_exposed(registry, "compute", other.pid):
+            assert registry.get_sample_value("compute_process_resident_memory_bytes", {})
+        assert registry.get_sample_value("compute_process_resident_memory_bytes", {}) is None
 
 
 def test_alerts_watch_metrics_that_exist() -> None:

@@ -100,7 +100,7 @@ def test_a_batch_has_the_epsilon_of_the_steps_that_its_version_had(
     played = Played(tmp_path, 6, f"training.lag={lag}", "algorithm.exploration.steps=80")
     update, used = played.trainer.algorithm.update, []
 
-    def watched(batch: Batch, policy_ready: Callable[[], None]) -> dict[str, float]:
+    def watched(batch: Batch, policy_ready: Callable[[Weights], None]) -> dict[str, float]:
         used.append(batch.epsilon)
         return update(batch, policy_ready)
 

@@ -2,52 +2,70 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from liir_common.config import AlgorithmConfig
-from liir_common.types import Batch, EnvSpec
+from liir_common.types import Array, Batch, EnvSpec, Weights
 from services.learner.algorithms.central_v import CentralV
 from services.learner.algorithms.coma import Coma
 from services.learner.algorithms.iac import Iac
 from services.learner.algorithms.iql import Iql
 from services.learner.algorithms.liir import Liir
 from services.learner.algorithms.qmix import Qmix
-from services.learner.algorithms.replay import Replay
 from services.learner.algorithms.vdn import Vdn
+
+
+class SavedReplay(Protocol):
+    """What the learner needs of a replay, see `Replay`."""
+
+    @property
+    def first(self) -> int:
+        """Number of the oldest episode that is here."""
+
+    @property
+    def total(self) -> int:
+        """Number of episodes that have ever been added."""
+
+    def frames(self, first: int) -> list[bytes]:
+        """The episodes from number `first` on."""
+
+    def restore(self, total: int, frames: Sequence[bytes]) -> None:
+        """Hold `frames`, the newest of `total` episodes."""
 
 
 class Algorithm(Protocol):
     """What the learner needs of a learning rule. Not thread-safe: one thread calls it."""
 
-    replay: Replay | None
-    """Episodes to learn from again, saved beside the state; None if the method is on-policy"""
+    @property
+    def replay(self) -> SavedReplay | None:
+        """Episodes to learn from again, saved beside the state; None if the method is on-policy."""
 
-    def policy(self) -> dict[str, NDArray[np.float32]]:
+    def policy(self) -> Weights:
         """Copies of the policy's weights under the names and shapes of `policy_shapes`."""
 
-    def intrinsic(self) -> dict[str, NDArray[np.float32]]:
+    def intrinsic(self) -> Weights:
         """Copies of the weights of the intrinsic reward; empty if the method has none."""
 
-    def update(self, batch: Batch, policy_ready: Callable[[], None] = lambda: None) -> dict[str, float]:
+    def update(
+        self, batch: Batch, policy_ready: Callable[[Weights], None] = lambda _: None
+    ) -> dict[str, float]:
         """One learner step; returns figures by name, those without a value in this batch left out.
 
-        `policy_ready` is called once, as soon as `policy()` is what this step leaves: the next batch can be
-        played with it while the rest of the step is made.
+        `policy_ready` is called once, with what `policy()` is after this step, as soon as that is known: the
+        next batch can be played with it while the rest of the step is made.
 
         Raises:
             ValueError: the batch does not fit; nothing has changed then.
             FloatingPointError: learning has diverged.
         """
 
-    def state(self) -> dict[str, torch.Tensor]:
-        """Copies, on the CPU, of everything that `update` depends on but the replay."""
+    def state(self) -> dict[str, Array]:
+        """Copies of everything that `update` depends on but the replay."""
 
-    def load_state(self, state: Mapping[str, torch.Tensor]) -> None:
+    def load_state(self, state: Mapping[str, Array]) -> None:
         """Go on from `state`, bit for bit as if never stopped.
 
         Raises:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from liir_common import seeds
 from liir_common.config import AlgorithmConfig
-from liir_common.types import Batch, EnvSpec
+from liir_common.types import Array, Batch, EnvSpec, Weights
 from services.learner.algorithms.critic import Critic
 from services.learner.algorithms.data import Data, prepare
 from services.learner.algorithms.networks import Mlp, coma_critic_size
@@ -57,11 +57,11 @@ class ActorCritic:
         budget = coma_critic_size(self._spec)
         return {"theta": self._policy.theta.numel(), "varphi": self._varphi.size, "budget": budget}
 
-    def state(self) -> dict[str, Tensor]:
+    def state(self) -> dict[str, Array]:
         """Copies of everything that `update` depends on, on the CPU."""
         return snapshot(self._tensors())
 
-    def load_state(self, state: Mapping[str, Tensor]) -> None:
+    def load_state(self, state: Mapping[str, Array]) -> None:
         """Go on from `state`, bit for bit as if never stopped.
 
         Raises:
@@ -76,7 +76,7 @@ class ActorCritic:
         limit = self._config.limit_is_terminal
         return prepare(batch, self._spec, limit_is_terminal=limit, device=self._device, dtype=self._dtype)
 
-    def _announce(self, policy_ready: Callable[[], None]) -> None:
+    def _announce(self, policy_ready: Callable[[Weights], None]) -> None:
         """Say that the policy is what the step leaves; what follows, the fits of critics, does not touch it.
 
         Raises:
@@ -84,7 +84,7 @@ class ActorCritic:
         """
         if not torch.isfinite(self._policy.theta).all():
             raise FloatingPointError("learning has diverged: the policy is not finite")
-        policy_ready()
+        policy_ready(self.policy())
 
     def _return(self, data: Data, reward: Tensor, value: Tensor) -> Tensor:
         """TD(λ_g) returns [B, T, k] of `reward` [B, T, k] over `value` [B, T+1, k]."""

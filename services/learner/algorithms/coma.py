@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from liir_common.config import AlgorithmConfig
-from liir_common.types import Batch, EnvSpec
+from liir_common.types import Batch, EnvSpec, Weights
 from services.learner.algorithms.actor_critic import ActorCritic
 from services.learner.algorithms.data import Data, observations
 from services.learner.algorithms.metrics import to_floats
@@ -29,7 +29,9 @@ class Coma(ActorCritic):
     ) -> None:
         super().__init__(spec, config, seed, device, dtype, CounterfactualValue(spec))
 
-    def update(self, batch: Batch, policy_ready: Callable[[], None] = lambda: None) -> dict[str, float]:
+    def update(
+        self, batch: Batch, policy_ready: Callable[[Weights], None] = lambda _: None
+    ) -> dict[str, float]:
         """One learner step on `batch`; returns its figures. `policy_ready` is as in `Algorithm`.
 
         Raises:

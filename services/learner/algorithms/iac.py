@@ -11,7 +11,7 @@ from collections.abc import Callable
 import torch
 
 from liir_common.config import AlgorithmConfig
-from liir_common.types import Batch, EnvSpec
+from liir_common.types import Batch, EnvSpec, Weights
 from services.learner.algorithms.actor_critic import ActorCritic
 from services.learner.algorithms.data import observations
 from services.learner.algorithms.metrics import to_floats
@@ -27,7 +27,9 @@ class Iac(ActorCritic):
         width = fit_width(coma_critic_size(spec), lambda width: count(LocalValue(spec, width).shapes))
         super().__init__(spec, config, seed, device, dtype, LocalValue(spec, width))
 
-    def update(self, batch: Batch, policy_ready: Callable[[], None] = lambda: None) -> dict[str, float]:
+    def update(
+        self, batch: Batch, policy_ready: Callable[[Weights], None] = lambda _: None
+    ) -> dict[str, float]:
         """One learner step on `batch`; returns its figures. `policy_ready` is as in `Algorithm`.
 
         The team's reward goes on after an agent's death, and so do its returns: the dead see zeros.

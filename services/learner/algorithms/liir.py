@@ -23,7 +23,7 @@ from torch import Tensor
 
 from liir_common import seeds
 from liir_common.config import AlgorithmConfig
-from liir_common.types import Batch, EnvSpec
+from liir_common.types import Array, Batch, EnvSpec, Weights
 from services.learner.algorithms.actor_critic import ETA, PHI, ActorCritic
 from services.learner.algorithms.critic import Critic
 from services.learner.algorithms.data import Data
@@ -82,7 +82,9 @@ class Liir(ActorCritic):
         self._learns_reward = config.lambda_ > 0 and not config.freeze_eta
         self._pending: Inner | None = None
 
-    def update(self, batch: Batch, policy_ready: Callable[[], None] = lambda: None) -> dict[str, float]:
+    def update(
+        self, batch: Batch, policy_ready: Callable[[Weights], None] = lambda _: None
+    ) -> dict[str, float]:
         """One iteration of Algorithm 1 on `batch`; returns its figures. `policy_ready` is as in `Algorithm`.
 
         Step 5 of the algorithm judges θ' on the samples that made it or, one batch later, on fresh ones.
@@ -164,13 +166,13 @@ class Liir(ActorCritic):
         """Parameters of each network and the budget of all but θ."""
         return super().parameter_counts() | {"eta": self._eta.numel(), "phi": self._phi.size}
 
-    def state(self) -> dict[str, Tensor]:
+    def state(self) -> dict[str, Array]:
         """As the base class, with the pending step of fresh outer samples."""
         return super().state() | (
             snapshot(prefixed("pending", _pack(self._pending))) if self._pending else {}
         )
 
-    def load_state(self, state: Mapping[str, Tensor]) -> None:
+    def load_state(self, state: Mapping[str, Array]) -> None:
         """As the base class, with the pending step of fresh outer samples."""
         fresh = self._config.outer_samples == "fresh"
         pending = {k: v for k, v in state.items() if fresh and k.startswith("pending.")}
@@ -185,15 +187,17 @@ class Liir(ActorCritic):
         eta = {"parameters": self._eta} | prefixed("optimizer", self._eta_optimizer.tensors())
         return super()._tensors() | prefixed("eta", eta) | prefixed("phi", self._phi.tensors())
 
-    def _unpack(self, tensors: Mapping[str, Tensor]) -> Inner:
-        if tensors.keys() != _PENDING:
-            raise ValueError(f"a pending step wants {sorted(_PENDING)}, got {sorted(tensors)}")
-        packed = {name: tensors[f"batch.{name}"].numpy() for name in _BATCH}
+    def _unpack(self, pending: Mapping[str, Array]) -> Inner:
+        if pending.keys() != _PENDING:
+            raise ValueError(f"a pending step wants {sorted(_PENDING)}, got {sorted(pending)}")
+        packed = {name: pending[f"batch.{name}"] for name in _BATCH}
         named: dict[str, Any] = {
             name: value if value.ndim else value.item() for name, value in packed.items()
         }
         batch = Batch(**named)
-        value, target, theta, gradient, diagonal = (tensors[name].to(self._device) for name in _STEP)
+        value, target, theta, gradient, diagonal = (
+            torch.tensor(pending[name], device=self._device) for name in _STEP
+        )
         step = Step(gradient, diagonal, self._config.policy_optimizer.clip)
         data = self._prepare(batch)
         eta, r_in = self._intrinsic_reward(data)

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from liir_common import seeds
 from liir_common.config import AlgorithmConfig
-from liir_common.types import Batch, EnvSpec
+from liir_common.types import Array, Batch, EnvSpec, Weights
 from services.learner.algorithms.data import Data, check, prepare
 from services.learner.algorithms.metrics import to_floats
 from services.learner.algorithms.networks import Network, arrays, count, initial
@@ -95,11 +95,11 @@ class QLearning:
         """Parameters of each network; the paper sets no budget here."""
         return {"theta": count(self._network.shapes), "mixer": count(self._mixer.shapes)}
 
-    def state(self) -> dict[str, Tensor]:
+    def state(self) -> dict[str, Array]:
         """Copies of everything that `update` depends on but the replay, on the CPU."""
         return snapshot(self._tensors())
 
-    def load_state(self, state: Mapping[str, Tensor]) -> None:
+    def load_state(self, state: Mapping[str, Array]) -> None:
         """Go on from `state`, bit for bit as if never stopped, once the replay is restored, too.
 
         Raises:
@@ -107,7 +107,9 @@ class QLearning:
         """
         restore(self._tensors(), state)
 
-    def update(self, batch: Batch, policy_ready: Callable[[], None] = lambda: None) -> dict[str, float]:
+    def update(
+        self, batch: Batch, policy_ready: Callable[[Weights], None] = lambda _: None
+    ) -> dict[str, float]:
         """One learner step: keep `batch` and learn from the replay, as often as the episodes so far allow.
 
         The figures are those of the last update on a sample; there is none until the replay holds enough.
@@ -129,7 +131,7 @@ class QLearning:
         if self._config.target_interval and int(self._steps) % self._config.target_interval == 0:
             self._target.copy_(self._parameters)
         figures = to_floats(metrics) if metrics else {}
-        policy_ready()
+        policy_ready(self.policy())
         return figures
 
     def _sample(self) -> Sample:

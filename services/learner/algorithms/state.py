@@ -1,4 +1,4 @@
-"""Saving and restoring what an algorithm depends on, as flat names to tensors."""
+"""Saving and restoring what an algorithm depends on, as flat names to arrays."""
 
 from __future__ import annotations
 
@@ -7,19 +7,21 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from liir_common.types import Array
+
 
 def prefixed(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """The same tensors under `prefix.name`."""
     return {f"{prefix}.{name}": tensor for name, tensor in tensors.items()}
 
 
-def snapshot(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Copies on the CPU."""
-    return {name: tensor.detach().clone().cpu() for name, tensor in tensors.items()}
+def snapshot(tensors: Mapping[str, Tensor]) -> dict[str, Array]:
+    """Copies."""
+    return {name: tensor.detach().cpu().contiguous().numpy().copy() for name, tensor in tensors.items()}
 
 
 @torch.no_grad()
-def restore(live: Mapping[str, Tensor], state: Mapping[str, Tensor]) -> None:
+def restore(live: Mapping[str, Tensor], state: Mapping[str, Array]) -> None:
     """Copy `state` into the `live` tensors; nothing is touched unless all of it fits.
 
     Raises:
@@ -30,9 +32,10 @@ def restore(live: Mapping[str, Tensor], state: Mapping[str, Tensor]) -> None:
         raise ValueError(
             f"this state is of another algorithm or configuration: missing {missing}, unknown {unknown}"
         )
+    saved = {name: torch.tensor(array) for name, array in state.items()}
     for name, tensor in live.items():
-        wanted, got = (tuple(tensor.shape), tensor.dtype), (tuple(state[name].shape), state[name].dtype)
+        wanted, got = (tuple(tensor.shape), tensor.dtype), (tuple(saved[name].shape), saved[name].dtype)
         if wanted != got:
             raise ValueError(f"state {name} wants shape and dtype {wanted}, got {got}")
     for name, tensor in live.items():
-        tensor.copy_(state[name])
+        tensor.copy_(saved[name])

@@ -1,4 +1,4 @@
-"""Settings of the process that trains."""
+"""How a process of the learner keeps its memory."""
 
 from __future__ import annotations
 
@@ -6,21 +6,18 @@ import ctypes
 import gc
 import sys
 
-import torch
-
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8
 _KEEP_BYTES = 1 << 30
 
 
-def set_up_process(threads: int) -> None:
-    """Give matrix products of the calling thread `threads` threads, and keep freed memory.
+def keep_memory() -> None:
+    """Keep what is freed, and look no more for garbage in what is there by now.
 
     glibc hands every freed block of a megabyte back to the system, and getting it anew costs a learner step
     more page faults than arithmetic. Threads but the first would have arenas of their own that do so
-    whatever the thresholds, so all share one; call this before the thread that trains is started, too.
+    whatever the thresholds, so all share one; call this before others are started.
     """
-    gc.freeze()  # What is there by now mostly stays; no collection has to look through it again.
-    torch.set_num_threads(threads)
+    gc.freeze()
     if sys.platform == "linux":
         libc = ctypes.CDLL(None)
         if hasattr(libc, "mallopt"):

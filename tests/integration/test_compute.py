@@ -1,0 +1,142 @@
+"""The process that computes: the same bits as here, errors that come back, and an end with its parent."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+
+import numpy as np
+import psutil
+import pytest
+import torch
+
+from liir_common import config, seeds
+from liir_common.errors import ComputeError, ConfigError
+from liir_common.types import Batch, EnvSpec, Weights
+from services.learner.algorithms import Algorithm, make_algorithm
+from services.learner.bench import synthetic_batch
+from services.learner.compute import Compute
+from tests.e2e.service import wait_for
+
+SPEC = EnvSpec("test", "1", "{}", 3, 4, 3, 5, 9, ())
+REPLAY = ["algorithm.replay.episodes=20", "algorithm.replay.batch_episodes=5"]
+PARENT = f"""
+from liir_common import config
+from liir_common.types import EnvSpec
+from services.learner.compute import Compute
+compute = Compute({SPEC!r}, config.load(None, ["learner.device=cpu"]))
+print(compute.pid, flush=True)
+input()
+"""
+
+
+def settings(*more: str) -> config.Config:
+    return config.load(None, ["algorithm.policy_hidden=8", "learner.device=cpu", "learner.threads=1", *more])
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def batch_of(seed: int) -> Batch:
+    return synthetic_batch(SPEC, episodes=6, steps=6, seed=seed, policy_version=seed, epsilon=0.2)
+
+
+def same(a: Weights, b: Weights) -> bool:
+    return a.keys() == b.keys() and all(
+        a[name].dtype == b[name].dtype and np.array_equal(a[name], b[name]) for name in a
+    )
+
+
+def seen(algorithm: Algorithm) -> tuple[list[object], list[Weights]]:
+    """Figures of two updates and parameter counts; policies announced and in the end, r_in and the state."""
+    policies: list[Weights] = []
+    figures: list[object] = [algorithm.update(batch_of(seed), policies.append) for seed in range(2)]
+    arrays = [*policies, algorithm.policy(), algorithm.intrinsic(), algorithm.state()]
+    return [*figures, algorithm.parameter_counts()], arrays
+
+
+@pytest.mark.parametrize("method", [["algorithm=liir"], ["algorithm=qmix", *REPLAY]], ids=" ".join)
+def test_it_learns_the_same_bits(method: list[str]) -> None:
+    resolved = settings(*method)
+    with one_thread(), Compute(SPEC, resolved) as there:
+        seed = seeds.derive(resolved.seed, seeds.LEARNER)
+        here = make_algorithm(SPEC, resolved.algorithm, seed, torch.device("cpu"))
+        for _ in range(2):
+            wanted, got = seen(here), seen(there)
+            assert got[0] == wanted[0]
+            assert len(wanted[1]) == 5
+            assert all(map(same, got[1], wanted[1]))
+        if here.replay is None:
+            assert there.replay is None
+        else:
+            assert there.replay is not None
+            assert (
+                (there.replay.first, there.replay.total) == (here.replay.first, here.replay.total) == (4, 24)
+            )
+            assert there.replay.frames(10) == here.replay.frames(10)
+            frames = there.replay.frames(4)
+            there.replay.restore(30, frames)
+            assert (there.replay.first, there.replay.frames(10)) == (10, frames)
+        state = here.state()
+        there.update(batch_of(7))
+        assert not same(there.state(), state)
+        there.load_state(state)
+        assert same(there.state(), state)
+
+
+def test_what_is_raised_there_is_raised_here_and_it_goes_on() -> None:
+    with Compute(SPEC, settings()) as compute:
+        before = compute.state()
+        batch = batch_of(0)
+        with pytest.raises(ValueError, match="mask without any"):
+            compute.update(replace(batch, mask=np.zeros_like(batch.mask)))
+        with pytest.raises(ValueError, match="missing"):
+            compute.load_state({})
+        assert same(compute.state(), before)
+        with pytest.raises(FloatingPointError, match="diverged"):
+            compute.update(replace(batch, reward=batch.reward + np.float32(np.inf)))
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is the device that this asks for in vain")
+def test_a_device_that_is_not_there_is_explained() -> None:
+    with pytest.raises(ConfigError, match=r"learner\.device: wanted a CUDA device"):
+        Compute(SPEC, settings("learner.device=cuda"))
+
+
+def test_signals_are_for_the_learner_and_what_kills_it_is_told() -> None:
+    with Compute(SPEC, settings()) as compute:
+        for signum in (signal.SIGINT, signal.SIGTERM):  # as a terminal sends them, to all
+            os.kill(compute.pid, signum)
+        assert compute.parameter_counts()
+        os.kill(compute.pid, signal.SIGKILL)
+        with pytest.raises(ComputeError, match="learner steps is gone: SIGKILL killed it; resume the run"):
+            compute.update(batch_of(0))
+        with pytest.raises(ComputeError, match="is gone"):
+            compute.policy()
+
+
+def test_it_ends_with_whoever_started_it() -> None:
+    parent = subprocess.Popen(
+        [sys.executable, "-c", PARENT], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    assert parent.stdout is not None
+    pid = int(parent.stdout.readline())
+    assert runs(pid)
+    parent.kill()
+    parent.communicate()
+    wait_for(lambda: not runs(pid), "the end of the process that computes")
+
+
+def runs(pid: int) -> bool:
+    """Whether there is such a process, dead ones that nobody has asked for left out."""
+    return psutil.pid_exists(pid) and psutil.Process(pid).status() != psutil.STATUS_ZOMBIE

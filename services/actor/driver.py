@@ -26,7 +26,7 @@ log = structlog.get_logger()
 
 _POLL_S, _POLL_WHILE_STARTING_S = 1.0, 0.1
 _RAY_START_S = 180.0
-"""Ray that has not started by then never will: a machine that slept meanwhile leaves it waiting for itself."""
+"""Ray that has not started by then never will: a machine that slept meanwhile leaves it waiting."""
 _QUICK_DEATH_S = 10.0
 """An actor that dies sooner is started again more and more slowly."""
 

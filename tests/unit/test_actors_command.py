@@ -13,7 +13,6 @@ from liir_common import config
 from liir_common.errors import ConfigError
 from services.actor import __main__ as command
 
-
 HANGING = """
 import time, ray
 from liir_common import config

@@ -77,7 +77,8 @@ def print_summary(run_dir: Path, summary: Summary) -> None:
     """Print the summary of the run in `run_dir` for a person to read."""
     print(f"\n{run_dir}")
     for name, value in asdict(summary).items():
-        print(f"  {name.replace('_', ' '):30} {'–' if value is None else value}")
+        shown = "–" if value is None else f"{value:.4g}" if isinstance(value, float) else value
+        print(f"  {name.replace('_', ' '):30} {shown}")
     if summary.evaluations:
         print(f"  curve: {run_dir / 'winrate.png'}")
 

@@ -3,6 +3,9 @@
 import asyncio
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Annotated
+
+import typer
 
 from liir_common import logs, options
 from liir_common.config import holds_run
@@ -14,7 +17,7 @@ from services.learner.service import serve
 
 
 def learner(
-    run_dir: options.RunDir = None,
+    run_dir: Annotated[Path, typer.Option("--run-dir", help="Run directory.")] = Path("runs/learner"),
     config: options.ConfigFile = None,
     settings: options.Settings = None,
     resume: options.Resume = False,
@@ -22,15 +25,14 @@ def learner(
 ) -> None:
     """Train a run: serve tickets to actors, checkpoints to evaluators."""
     logs.configure("learner")
-    path = run_dir or Path("runs/learner")
-    resume = resume or (resume_if_begun and holds_run(path))
+    resume = resume or (resume_if_begun and holds_run(run_dir))
     with exit_on_error():
-        resolved = options.load_run_config(config, settings, path, resume)
+        resolved = options.load_run_config(config, settings, run_dir, resume)
         spec = env_spec(resolved.env)
         with ExitStack() as stack:
-            with storage_explained(path):
-                stack.enter_context(held(path))
-                run = RunDirectory(path, resolved, spec)
+            with storage_explained(run_dir):
+                stack.enter_context(held(run_dir))
+                run = RunDirectory(run_dir, resolved, spec)
             asyncio.run(serve(resolved, run, spec))
 
 

@@ -88,6 +88,11 @@ def test_the_battle_needs_the_base_dependencies_alone() -> None:
         run("import liir_common.config", blocked, ROOT)
 
 
+def test_the_command_says_what_to_install_where_the_battle_is_alone() -> None:
+    with pytest.raises(AssertionError, match=r"error: the liir command needs typer; pip install"):
+        run("from liir_common.console import main; main()", all_but_base_dependencies(), ROOT)
+
+
 def test_the_client_and_its_policies_need_its_extra_alone(tmp_path: Path) -> None:
     """A checkpoint is fetched and played without torch, Ray or what else the service has."""
     blocked = all_but_base_dependencies("client")

@@ -1,0 +1,15 @@
+"""The `liir` command, wherever the package is installed without what the command needs, too."""
+
+import sys
+
+
+def main() -> None:
+    """Run it, or say what to install."""
+    try:
+        from liir_common import cli
+    except ModuleNotFoundError as error:
+        sys.exit(
+            f"error: the liir command needs {error.name}; pip install 'liir-service[client]' has what fetches "
+            "and plays checkpoints, liir-service[service] all that trains"
+        )
+    cli.main()

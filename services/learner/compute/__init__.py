@@ -71,11 +71,7 @@ class Compute:
     def close(self) -> None:
         """End the process; no thread may be waiting for an answer."""
         self._connection.close()
-        try:
-            self._process.wait(_END_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+        self._end()
 
     def policy(self) -> Weights:
         """As `Algorithm.policy`."""
@@ -126,8 +122,16 @@ class Compute:
                 raise value
             policy_ready(value)
 
+    def _end(self) -> int:
+        """The code that the process ends with, now that one side of the connection is closed."""
+        try:
+            return self._process.wait(_END_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            return self._process.wait()
+
     def _death(self) -> ComputeError:
-        code = self._process.wait()
+        code = self._end()
         how = f"{signal.Signals(-code).name} killed it" if code < 0 else f"it ended with code {code}"
         return ComputeError(
             f"the process that computes learner steps is gone: {how}; resume the run, which goes on from its "

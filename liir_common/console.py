@@ -9,7 +9,7 @@ def main() -> None:
         from liir_common import cli
     except ModuleNotFoundError as error:
         sys.exit(
-            f"error: the liir command needs {error.name}; pip install 'liir-service[client]' brings what fetches "
-            "checkpoints and plays them, 'liir-service[service]' all that trains"
+            f"error: the liir command needs {error.name}; install 'liir-service[client]' for what fetches "
+            "checkpoints and plays them, 'liir-service[service]' for all that trains"
         )
     cli.main()

@@ -89,7 +89,7 @@ def test_the_battle_needs_the_base_dependencies_alone() -> None:
 
 
 def test_the_command_says_what_to_install_where_the_battle_is_alone() -> None:
-    with pytest.raises(AssertionError, match=r"error: the liir command needs typer; pip install"):
+    with pytest.raises(AssertionError, match=r"error: the liir command needs typer; install"):
         run("from liir_common.console import main; main()", all_but_base_dependencies(), ROOT)
 
 

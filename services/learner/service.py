@@ -44,9 +44,6 @@ async def serve(config: Config, run: RunDirectory, spec: EnvSpec) -> None:
     server = Server(
         config.learner.host, config.learner.port, config.security, insecure=config.learner.insecure
     )
-    metrics_port = metrics.serve(
-        metrics.LEARNER, config.metrics.host, config.learner.metrics_port, "learner.metrics_port"
-    )
     with (
         Compute(spec, config) as algorithm,
         metrics.process_exposed(metrics.LEARNER, "compute", algorithm.pid),
@@ -54,10 +51,10 @@ async def serve(config: Config, run: RunDirectory, spec: EnvSpec) -> None:
         log.info("parameters", **algorithm.parameter_counts())
         with storage_explained(run.path):
             run.write_parameters(algorithm.parameter_counts())
-        await _train(run, algorithm, server, f"{config.metrics.host}:{metrics_port}")
+        await _train(run, algorithm, server)
 
 
-async def _train(run: RunDirectory, algorithm: Algorithm, server: Server, metrics_address: str) -> None:
+async def _train(run: RunDirectory, algorithm: Algorithm, server: Server) -> None:
     config, loop = run.config, asyncio.get_running_loop()
     on_loop = _OnLoop(loop)
 
@@ -86,9 +83,14 @@ async def _train(run: RunDirectory, algorithm: Algorithm, server: Server, metric
     for signum in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(signum, stop, signum.name)
 
+    metrics_port = metrics.serve(
+        metrics.LEARNER, config.metrics.host, config.learner.metrics_port, "learner.metrics_port"
+    )
     await server.start()
     with storage_explained(run.path):
-        run.write_endpoints({"address": server.local_address, "metrics": metrics_address})
+        run.write_endpoints(
+            {"address": server.local_address, "metrics": f"{config.metrics.host}:{metrics_port}"}
+        )
     log.info("serving", address=f"{config.learner.host}:{server.port}", run=str(run.path))
     expiry = asyncio.create_task(rollouts.expire_tickets())
     learning = asyncio.create_task(asyncio.to_thread(trainer.run))

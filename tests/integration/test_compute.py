@@ -100,8 +100,9 @@ def test_what_is_raised_there_is_raised_here_and_it_goes_on() -> None:
         batch = batch_of(0)
         with pytest.raises(ValueError, match="mask without any"):
             compute.update(replace(batch, mask=np.zeros_like(batch.mask)))
-        with pytest.raises(ValueError, match="missing"):
+        with pytest.raises(ValueError, match="missing") as raised:
             compute.load_state({})
+        assert "in restore" in raised.value.__notes__[0], "the traceback of the other process"
         assert same(compute.state(), before)
         with pytest.raises(FloatingPointError, match="diverged"):
             compute.update(replace(batch, reward=batch.reward + np.float32(np.inf)))

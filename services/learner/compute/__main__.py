@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import sys
+import traceback
 from collections.abc import Callable
 from contextlib import suppress
 from multiprocessing.connection import Connection
@@ -44,6 +45,7 @@ class Worker:
         try:
             answer = Answer.VALUE, self._do(what, arguments)
         except Exception as error:
+            error.add_note(f"There:\n{traceback.format_exc()}")  # which would stay behind
             answer = Answer.ERROR, error
         self._connection.send(answer)
 

@@ -48,9 +48,10 @@ async def serve(config: Config, run: RunDirectory, spec: EnvSpec) -> None:
         Compute(spec, config) as algorithm,
         metrics.process_exposed(metrics.LEARNER, "compute", algorithm.pid),
     ):
-        log.info("parameters", **algorithm.parameter_counts())
+        counts = algorithm.parameter_counts()
+        log.info("parameters", **counts)
         with storage_explained(run.path):
-            run.write_parameters(algorithm.parameter_counts())
+            run.write_parameters(counts)
         await _train(run, algorithm, server)
 
 

@@ -146,7 +146,10 @@ class Faults:
 
     def kill_compute(self) -> None:
         """The process beside the learner's; the learner cannot do without."""
-        for child in self.process("learner").children():
+        children = self.process("learner").children()
+        if not children:  # it has only begun
+            raise psutil.NoSuchProcess(0, "services.learner.compute")
+        for child in children:
             child.kill()
 
     def stop_learner(self) -> None:

@@ -25,10 +25,6 @@ class SavedReplay(Protocol):
     def first(self) -> int:
         """Number of the oldest episode that is here."""
 
-    @property
-    def total(self) -> int:
-        """Number of episodes that have ever been added."""
-
     def frames(self, first: int) -> list[bytes]:
         """The episodes from number `first` on."""
 

@@ -58,7 +58,7 @@ class ActorCritic:
         return {"theta": self._policy.theta.numel(), "varphi": self._varphi.size, "budget": budget}
 
     def state(self) -> dict[str, Array]:
-        """Copies of everything that `update` depends on, on the CPU."""
+        """Copies of everything that `update` depends on."""
         return snapshot(self._tensors())
 
     def load_state(self, state: Mapping[str, Array]) -> None:

@@ -96,7 +96,7 @@ class QLearning:
         return {"theta": count(self._network.shapes), "mixer": count(self._mixer.shapes)}
 
     def state(self) -> dict[str, Array]:
-        """Copies of everything that `update` depends on but the replay, on the CPU."""
+        """Copies of everything that `update` depends on but the replay."""
         return snapshot(self._tensors())
 
     def load_state(self, state: Mapping[str, Array]) -> None:

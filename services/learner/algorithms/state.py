@@ -16,8 +16,8 @@ def prefixed(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def snapshot(tensors: Mapping[str, Tensor]) -> dict[str, Array]:
-    """Copies."""
-    return {name: tensor.detach().cpu().contiguous().numpy().copy() for name, tensor in tensors.items()}
+    """Copies, each in one piece of memory."""
+    return {name: tensor.detach().cpu().numpy().copy() for name, tensor in tensors.items()}
 
 
 @torch.no_grad()

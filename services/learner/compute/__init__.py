@@ -1,4 +1,4 @@
-"""The learning rule in a process of its own, so that no update waits for the interpreter that serves.
+"""The learning rule in a process of its own, so that no update waits for what this one serves.
 
 The two processes speak over a pair of sockets that nobody else has: this one asks for one thing at a time,
 the other answers with it, or with the exception that it was. The other writes nothing, listens nowhere, and
@@ -149,11 +149,6 @@ class _Replay:
     def first(self) -> int:
         """As `Replay.first`."""
         return int(self._ask("replay.first"))
-
-    @property
-    def total(self) -> int:
-        """As `Replay.total`."""
-        return int(self._ask("replay.total"))
 
     def frames(self, first: int) -> list[bytes]:
         """As `Replay.frames`."""

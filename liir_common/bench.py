@@ -83,7 +83,7 @@ def _watch(process: subprocess.Popen[bytes], run_dir: Path, total: int) -> dict[
             continue
         if "services.learner" in command:
             found["learner_pss_mib"] += pss
-        if "ray::RolloutActor" in command:
+        if "ray::ActorProcess" in command:
             found["actor_pss_mib"] = max(found["actor_pss_mib"], pss)
             found["actors"] += 1
     return found

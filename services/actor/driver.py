@@ -20,7 +20,7 @@ from liir_common.errors import LiirError, RefusedError
 from liir_common.rpc import carry
 from liir_common.rpc.channel import backoffs
 from liir_common.rpc.tokens import Role
-from services.actor.rollout_actor import RolloutActor
+from services.actor.process import ActorProcess
 
 log = structlog.get_logger()
 
@@ -64,14 +64,15 @@ class Fleet:
         self._files = carry.pack(config.security, Role.ACTOR) if config.actors.send_security else {}
         # An actor waits more than it computes: it reserves so little that any number fits, and yet none goes
         # to a node without CPUs, which a cluster's head may be.
-        self._actor_class: Any = ray.remote(num_cpus=0.001)(RolloutActor)
+        self._actor_class: Any = ray.remote(num_cpus=0.001)(ActorProcess)
         self._count = config.actors.count
         self._members = [_Member(f"actor-{i:03d}") for i in range(self._count)]
         self._stopping = False
         self._waits = {member.name: backoffs() for member in self._members}
         metrics.ACTORS_WANTED.set(self._count)
-        # Starting is work for a core: one at a time on each, so that the first play while others start.
-        self._starting_at_once = max(1, int(ray.cluster_resources().get("CPU", 1)))
+        # Starting is work for a core: one at a time on each, so that the first play while others start, and
+        # one more, since a start also waits.
+        self._starting_at_once = 1 + max(1, int(ray.cluster_resources().get("CPU", 1)))
 
     def stop(self) -> None:
         """Let `run` return soon; may be called by a signal handler."""

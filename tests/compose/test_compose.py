@@ -191,9 +191,9 @@ def test_up_deaths_rotations_down_and_up_again(compose: Compose) -> None:
     wait_for(lambda: query("sum(up)") == 4, "four targets up")
     wait_for(lambda: query("liir_actors_connected") == ACTORS, "all actors connected")
     for index in range(1, WORKERS + 1):
-        assert len(compose.processes("ray-worker", "ray::RolloutActor", index)) == ACTORS // WORKERS
+        assert len(compose.processes("ray-worker", "ray::ActorProcess", index)) == ACTORS // WORKERS
     for service in ("ray-head", "actors"):
-        assert not compose.processes(service, "ray::RolloutActor")
+        assert not compose.processes(service, "ray::ActorProcess")
     wait_for(lambda: query('max_over_time(liir_win_rate{actions="sampled"}[1h])') > 0, "a battle won")
 
     # A service has the token of its role, and from outside it takes TLS and one, too.

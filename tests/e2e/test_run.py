@@ -87,7 +87,7 @@ def test_lag_one_is_deterministic_and_lags(tmp_path: Path) -> None:
 
 
 def kill_actor(process: subprocess.Popen[str], run_dir: Path) -> None:
-    service.kill(service.descendants(process, "ray::RolloutActor")[0])
+    service.kill(service.descendants(process, "ray::ActorProcess")[0])
 
 
 def kill_driver(process: subprocess.Popen[str], run_dir: Path) -> None:
@@ -150,7 +150,7 @@ def test_an_actor_killed_in_the_middle_of_an_episode_changes_nothing(
     run_dir = tmp_path / "run"
     with service.training(run_dir) as process:
         service.wait_for(lambda: service.learner_step(run_dir) >= 5, "the fifth learner step")
-        victims = service.descendants(process, "ray::RolloutActor")
+        victims = service.descendants(process, "ray::ActorProcess")
         assert len(victims) == 2
         for victim in victims:
             victim.suspend()

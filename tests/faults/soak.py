@@ -35,7 +35,7 @@ PROCESSES = {
     "compute": "services.learner.compute",
     "driver": "services.actor",
     "evaluator": "services.evaluator",
-    "actor": "ray::RolloutActor",
+    "actor": "ray::ActorProcess",
 }
 EVERY_S = 2.0
 START_S = 600.0

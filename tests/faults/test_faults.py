@@ -106,10 +106,10 @@ class Faults:
             process
             for name in ("node-0", "node-1")
             for process in self.supervisor.services[name].tree()
-            if "RolloutActor" in _title(process)
+            if "ActorProcess" in _title(process)
         ]
         if not actors:
-            raise psutil.NoSuchProcess(0, "RolloutActor")
+            raise psutil.NoSuchProcess(0, "ActorProcess")
         return self._random.choice(actors)
 
     def cut_actors(self) -> None:

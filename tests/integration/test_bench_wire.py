@@ -8,6 +8,7 @@ from services.learner.bench_wire import bench_beside, bench_policy, bench_wire
 def test_every_stream_gets_every_policy() -> None:
     result = bench_policy("3m", streams=3, repeats=4)
     assert 0 < result["policy_ms"] <= result["slowest_ms"]
+    assert 0 < result["answering_policy_ms"] <= result["answering_slowest_ms"]
     assert result["bytes_per_policy"] > 100_000
 
 

@@ -159,7 +159,7 @@ def test_up_submit_a_worker_lost_and_back_finish_down(cluster: Cluster, tmp_path
     cluster.worker.lose()
     lost_at = running()
     wait_for(lambda: running() > lost_at + 3, "learner steps without the worker")
-    wait_for(lambda: processes(cluster.head, "ray::RolloutActor") == ACTORS, "all actors on the head")
+    wait_for(lambda: processes(cluster.head, "ray::ActorProcess") == ACTORS, "all actors on the head")
     cluster.worker.boot(SSHD, cluster.user)
     wait_for(lambda: running() and actors(cluster) == (ACTORS // 2, ACTORS // 2), "actors on both again", 600)
 
@@ -194,4 +194,4 @@ def test_up_submit_a_worker_lost_and_back_finish_down(cluster: Cluster, tmp_path
 
 def actors(cluster: Cluster) -> tuple[int, int]:
     """How many rollout actors there are on the head and on the worker."""
-    return processes(cluster.head, "ray::RolloutActor"), processes(cluster.worker, "ray::RolloutActor")
+    return processes(cluster.head, "ray::ActorProcess"), processes(cluster.worker, "ray::ActorProcess")

@@ -13,6 +13,14 @@ from liir_common.cli.shared import Json, Map, print_result
 bench = typer.Typer(no_args_is_help=True, help="Measure speed on this machine; medians.")
 
 
+@bench.callback()
+def _log_to_stderr() -> None:
+    """What is measured logs; stdout is for the result."""
+    from liir_common import logs
+
+    logs.configure("bench")
+
+
 @bench.command("sim")
 def bench_sim_command(
     map_name: Map = "3m",

@@ -12,7 +12,7 @@ from collections.abc import AsyncIterator, Iterable, Iterator, MutableSequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from statistics import median
-from typing import Any
+from typing import Any, NamedTuple
 
 import grpc
 
@@ -36,6 +36,16 @@ _AHEAD = 8
 """Batches open at a time, so that no stream ever waits for the learner step that is left out."""
 
 
+class _Shared(NamedTuple):
+    """What the clients' processes have in common with this one."""
+
+    arrivals: MutableSequence[float]
+    """Per stream, when it got the newest policy, on the monotonic clock of all processes"""
+    together: Any
+    """Whether all wait with their answers for the last who gets a ticket: a shared boolean"""
+    barrier: threading.Barrier
+
+
 @dataclass
 class _Intake:
     """A learner that neither learns nor plays: batches are opened and come back."""
@@ -43,8 +53,7 @@ class _Intake:
     service: RolloutService
     delivered: queue.SimpleQueue[list[Trajectory] | None]
     weights: Weights
-    arrivals: MutableSequence[float]
-    """Per stream, when it got the newest policy, on the monotonic clock of all processes"""
+    shared: _Shared
     opened: int = 0
 
     def open(self, policy_version: int = 0) -> None:
@@ -58,11 +67,9 @@ class _Intake:
 
 
 @asynccontextmanager
-async def _intake(
-    settings: config.Config, streams: int, tickets: int, together: bool = False
-) -> AsyncIterator[_Intake]:
+async def _intake(settings: config.Config, streams: int, tickets: int) -> AsyncIterator[_Intake]:
     """Clients are processes of their own, each with one stream that holds `tickets`, and answer every ticket
-    with the same real episode: at once, or `together`, when the last of them has its tickets."""
+    with the same real episode."""
     spec = env_spec(settings.env)
     delivered: queue.SimpleQueue[list[Trajectory] | None] = queue.SimpleQueue()
     service = RolloutService(settings, spec, 0, delivered)
@@ -71,14 +78,12 @@ async def _intake(
     await server.start()
     spawn = multiprocessing.get_context("spawn")
     arrivals: Any = spawn.Array("d", streams, lock=False)
-    barrier = spawn.Barrier(streams) if together else None
+    shared = _Shared(arrivals, spawn.Value("b", False, lock=False), spawn.Barrier(streams))
     address = f"127.0.0.1:{server.port}"
     # Played here: every client would load the compiled code, or compile it.
     episode = _episode(settings).SerializeToString()
     clients = [
-        spawn.Process(
-            target=_client, args=(address, spec.hash, tickets, episode, arrivals, i, barrier), daemon=True
-        )
+        spawn.Process(target=_client, args=(address, spec.hash, tickets, episode, shared, i), daemon=True)
         for i in range(streams)
     ]
     for client in clients:
@@ -87,7 +92,8 @@ async def _intake(
         while service.actors < streams:
             await asyncio.sleep(0.1)
         weights = random_weights(spec, settings.algorithm.policy_hidden, seed=0)
-        yield _Intake(service, delivered, weights, arrivals)
+        yield _Intake(service, delivered, weights, shared)
+        await service.drain("measured", run_complete=True, grace_s=5.0)
     finally:
         for client in clients:
             client.terminate()
@@ -134,26 +140,29 @@ def bench_policy(map_name: str, streams: int = 32, repeats: int = 100) -> dict[s
     answer when all have it, or each answers at once, which takes cores from those that still wait."""
     settings = config.load(None, [f"env.map={map_name}", f"training.batch_episodes={streams}"])
 
-    async def measure(together: bool) -> tuple[list[float], int]:
-        latencies = []
-        async with _intake(settings, streams, 1, together) as intake:
-            for version in range(repeats + 1):
-                begin = time.monotonic()
-                intake.open(version)
-                await intake.next_batch()
-                assert min(intake.arrivals) >= begin  # a ticket for each
-                if version:  # the first is the warm-up
-                    latencies.append(max(intake.arrivals) - begin)
-            return latencies, codec.encode_policy(0, intake.weights).ByteSize()
+    async def latencies(intake: _Intake, together: bool) -> list[float]:
+        intake.shared.together.value = together
+        found = []
+        for _ in range(repeats + 1):
+            begin = time.monotonic()
+            intake.open(intake.opened)
+            await intake.next_batch()
+            assert min(intake.shared.arrivals) >= begin  # a ticket for each
+            found.append(max(intake.shared.arrivals) - begin)
+        return found[1:]  # the first is the warm-up
 
-    latencies, size = asyncio.run(measure(together=True))
-    answering, _ = asyncio.run(measure(together=False))
+    async def measure() -> tuple[list[float], list[float], int]:
+        async with _intake(settings, streams, tickets=1) as intake:
+            size = codec.encode_policy(0, intake.weights).ByteSize()
+            return await latencies(intake, together=True), await latencies(intake, together=False), size
+
+    waiting, answering, size = asyncio.run(measure())
     return {
         "map": map_name,
         "streams": streams,
         "bytes_per_policy": size,
-        "policy_ms": 1e3 * median(latencies),
-        "slowest_ms": 1e3 * max(latencies),
+        "policy_ms": 1e3 * median(waiting),
+        "slowest_ms": 1e3 * max(waiting),
         "answering_policy_ms": 1e3 * median(answering),
         "answering_slowest_ms": 1e3 * max(answering),
         "repeats": repeats,
@@ -223,27 +232,22 @@ def _episode(settings: config.Config) -> rollout_pb2.Trajectory:
     return codec.encode_trajectory(trajectory, rollout_pb2.ActorStats())
 
 
-def _client(
-    address: str,
-    spec_hash: str,
-    tickets: int,
-    episode: bytes,
-    arrivals: MutableSequence[float],
-    index: int,
-    barrier: threading.Barrier | None,
-) -> None:
+def _client(address: str, spec_hash: str, tickets: int, episode: bytes, shared: _Shared, index: int) -> None:
     trajectory = rollout_pb2.Trajectory.FromString(episode)
     outgoing: Outgoing = queue.SimpleQueue()
     hello = rollout_pb2.Hello(actor_id=f"bench-{os.getpid()}", env_spec_hash=spec_hash, build=build())
     outgoing.put(rollout_pb2.PlayRequest(hello=hello, ready=rollout_pb2.Ready(tickets=tickets)))
     with grpc.insecure_channel(address, options=CHANNEL_OPTIONS) as channel:
         for message in rollout_pb2_grpc.RolloutServiceStub(channel).Play(put_together(outgoing)):
+            if message.HasField("drain"):
+                break
             if message.HasField("policy"):
-                arrivals[index] = time.monotonic()
-            if barrier and message.tickets:
-                barrier.wait()
+                shared.arrivals[index] = time.monotonic()
+            if shared.together.value and message.tickets:
+                shared.barrier.wait()
             for request in gather(_answers(trajectory, message.tickets)):
                 outgoing.put(request)
+    outgoing.put(None)  # ends the thread in which gRPC reads the queue
 
 
 def _answers(

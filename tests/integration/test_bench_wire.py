@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
+
 from services.learner.bench_wire import bench_beside, bench_policy, bench_wire
 
 
@@ -23,3 +27,11 @@ def test_a_learner_learns_beside() -> None:
     result = bench_beside("3m", rate=100.0, streams=1, seconds=0.5)
     assert result["update_alone_ms"] > 0
     assert result["update_beside_ms"] > 0
+
+
+def test_nothing_but_the_result_is_on_stdout() -> None:
+    command = [sys.executable, "-m", "liir_common.cli", "bench", "policy", "--streams", "2", "--json"]
+    result = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert json.loads(result.stdout)["streams"] == 2
+    assert "actor joined" in result.stderr
+    assert "Traceback" not in result.stderr

@@ -28,7 +28,7 @@ from liir_common.errors import (
     UnreachableError,
 )
 from liir_common.files import appended_alone, write_atomic
-from liir_common.rpc.channel import DEADLINE_S, backoffs, connect
+from liir_common.rpc.channel import AWAY, DEADLINE_S, backoffs, connect
 from liir_common.rpc.gen.liir.v1 import (
     checkpoint_pb2,
     checkpoint_pb2_grpc,
@@ -37,8 +37,6 @@ from liir_common.rpc.gen.liir.v1 import (
 )
 from liir_common.rpc.tokens import Role
 
-AWAY = (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.DEADLINE_EXCEEDED)
-"""Codes that tell of the connection, not of the call: to try again may help."""
 _ERRORS = {grpc.StatusCode.NOT_FOUND: MissingError, grpc.StatusCode.DATA_LOSS: DamagedError}
 _PAGE = 1000
 _DOWNLOAD_TRIES = 5

@@ -16,6 +16,9 @@ MAX_MESSAGE_BYTES = 32 * 2**20
 """Largest message either side takes; a 27m_vs_30m episode has about 7 MiB."""
 DEADLINE_S = 10.0
 """Of every unary call."""
+AWAY = (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.DEADLINE_EXCEEDED, grpc.StatusCode.CANCELLED)
+"""Codes that tell of the connection, not of the call: to try again may help. No client here cancels a call:
+CANCELLED comes from a learner that ends in the middle of it."""
 KEEPALIVE_MS, KEEPALIVE_TIMEOUT_MS = 5_000, 7_000
 """A peer that answers no ping is given up after at most their sum."""
 KEEPALIVE_OPTIONS = (

@@ -25,7 +25,6 @@ from liir_common.rpc.tokens import Role
 
 log = structlog.get_logger()
 
-_RETRIED = (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.CANCELLED)
 _MOST_REFUSALS = 3
 """Of what was sent, with nothing taken in between: a damaged message is an accident, three are a fault."""
 
@@ -90,7 +89,7 @@ class RolloutActor:
         """
         refused = error.code() == grpc.StatusCode.INVALID_ARGUMENT
         self._refusals += refused
-        if error.code() not in _RETRIED and not (refused and self._refusals < _MOST_REFUSALS):
+        if error.code() not in channel.AWAY and not (refused and self._refusals < _MOST_REFUSALS):
             raise RefusedError(f"{error.code().name}: {error.details()}") from None
         if refused:
             log.error("the learner refused what this actor sent", reason=error.details())

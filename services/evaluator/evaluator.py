@@ -10,11 +10,11 @@ import structlog
 
 from liir_common import checkpoint, metrics, seeds
 from liir_common.build import build
-from liir_common.client import AWAY, CheckpointClient, TrainingClient
+from liir_common.client import CheckpointClient, TrainingClient
 from liir_common.config import Config
 from liir_common.errors import DamagedError, MissingError, RefusedError, UnreachableError
 from liir_common.rollout.player import Player
-from liir_common.rpc.channel import backoffs
+from liir_common.rpc.channel import AWAY, backoffs
 from liir_common.rpc.gen.liir.v1 import checkpoint_pb2
 from liir_common.rpc.tokens import Role
 from liir_common.types import Ticket, Weights

@@ -1,0 +1,77 @@
+"""What an evaluator makes of calls that fail, from a learner that has nothing to test."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from concurrent import futures
+from itertools import repeat
+from typing import Any
+
+import grpc
+import pytest
+
+from liir_common.build import build
+from liir_common.config import Config
+from liir_common.errors import RefusedError
+from liir_common.rollout.play import make_player
+from liir_common.rpc.gen.liir.v1 import (
+    checkpoint_pb2,
+    checkpoint_pb2_grpc,
+    training_pb2,
+    training_pb2_grpc,
+)
+from services.evaluator.evaluator import Evaluator
+
+PLAYER = make_player(Config().env)
+
+
+class Failing(checkpoint_pb2_grpc.CheckpointServiceServicer, training_pb2_grpc.TrainingServiceServicer):
+    """Each call of one method fails with the next code, until there are no more."""
+
+    def __init__(self, method: str, codes: tuple[grpc.StatusCode, ...]) -> None:
+        self.method, self.codes = method, list(codes)
+
+    def _answer(self, method: str, context: grpc.ServicerContext) -> None:
+        if method == self.method and self.codes:
+            context.abort(self.codes.pop(0), "as the test wants it")
+
+    def GetRun(self, request: Any, context: grpc.ServicerContext) -> training_pb2.GetRunResponse:
+        self._answer("GetRun", context)
+        return training_pb2.GetRunResponse(env_spec_hash=PLAYER.spec.hash, build=build())
+
+    def ListEvaluations(
+        self, request: Any, context: grpc.ServicerContext
+    ) -> checkpoint_pb2.ListEvaluationsResponse:
+        self._answer("ListEvaluations", context)
+        return checkpoint_pb2.ListEvaluationsResponse()
+
+    def WatchCheckpoints(self, request: Any, context: grpc.ServicerContext) -> Iterator[Any]:
+        self._answer("WatchCheckpoints", context)
+        yield from ()
+
+
+def evaluate(method: str, *codes: grpc.StatusCode) -> int:
+    """Let an evaluator work until it ends; returns how many of the codes are left."""
+    server, learner = grpc.server(futures.ThreadPoolExecutor(2)), Failing(method, codes)
+    checkpoint_pb2_grpc.add_CheckpointServiceServicer_to_server(learner, server)
+    training_pb2_grpc.add_TrainingServiceServicer_to_server(learner, server)
+    port = server.add_insecure_port("127.0.0.1:0")
+    server.start()
+    try:
+        Evaluator(f"127.0.0.1:{port}", Config(), PLAYER).run()
+    finally:
+        server.stop(0).wait()
+    return len(learner.codes)
+
+
+@pytest.mark.parametrize("method", ["GetRun", "ListEvaluations", "WatchCheckpoints"])
+def test_a_learner_that_is_away_is_waited_for(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """CANCELLED is what a call comes to whose learner ends in the middle of it."""
+    monkeypatch.setattr("services.evaluator.evaluator.backoffs", lambda: repeat(0.0))
+    codes = (grpc.StatusCode.CANCELLED, grpc.StatusCode.DEADLINE_EXCEEDED, grpc.StatusCode.CANCELLED)
+    assert evaluate(method, *codes) == 0
+
+
+def test_a_refusal_is_final() -> None:
+    with pytest.raises(RefusedError, match="PERMISSION_DENIED"):
+        evaluate("GetRun", grpc.StatusCode.PERMISSION_DENIED, grpc.StatusCode.CANCELLED)

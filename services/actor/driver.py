@@ -29,6 +29,8 @@ _RAY_START_S = 180.0
 """Ray that has not started by then never will: a machine that slept meanwhile leaves it waiting."""
 _QUICK_DEATH_S = 10.0
 """An actor that dies sooner is started again more and more slowly."""
+_SHUNNED_S = 30.0
+"""So long nobody is sent to a node on which an actor died; Ray needs less to see that a node is lost."""
 
 
 @dataclass
@@ -68,6 +70,8 @@ class Fleet:
         self._count = config.actors.count
         self._members = [_Member(f"actor-{i:03d}") for i in range(self._count)]
         self._stopping = False
+        self._shunned: dict[str, float] = {}
+        """Until when nobody is sent to a node, by Ray's id, on the monotonic clock."""
         self._waits = {member.name: backoffs() for member in self._members}
         metrics.ACTORS_WANTED.set(self._count)
         # Starting is work for a core: one at a time on each, so that the first play while others start, and
@@ -131,10 +135,12 @@ class Fleet:
         member.actor = member.run = None
 
     def _crowds(self) -> dict[str, int]:
-        """How many actors there are on each node that has CPUs."""
+        """How many actors there are on each node that has CPUs and is not shunned, unless all are."""
         placed = Counter(member.node for member in self._members if member.actor is not None)
-        nodes = [node for node in ray.nodes() if node["Alive"] and node["Resources"].get("CPU")]
-        return {node["NodeID"]: placed[node["NodeID"]] for node in nodes}
+        nodes = [node["NodeID"] for node in ray.nodes() if node["Alive"] and node["Resources"].get("CPU")]
+        now = time.monotonic()
+        welcome = [node for node in nodes if self._shunned.get(node, now) <= now]
+        return {node: placed[node] for node in welcome or nodes}
 
     def _collect_ended(self, timeout_s: float) -> None:
         running = {member.run: member for member in self._members if member.run is not None}
@@ -164,6 +170,8 @@ class Fleet:
             "an actor died; it is started again", actor=member.name, wait_s=round(wait, 2), error=str(error)
         )
         metrics.ACTOR_RESTARTS.inc()
+        # The node may be lost as well: it looks empty then, and Ray would let actors wait for it.
+        self._shunned[member.node] = now + _SHUNNED_S
         member.actor = member.ready = member.run = None
         member.start_at = now + wait
 

@@ -37,6 +37,15 @@ def crowds(fleet: Fleet) -> list[int]:
     return sorted(Counter(member.node for member in members).values())
 
 
+def incarnations(fleet: Fleet) -> int:
+    """How often any actor was started again."""
+    return sum(member.incarnation for member in fleet._members)
+
+
+def alive(node: str) -> bool:
+    return any(known["NodeID"] == node and known["Alive"] for known in ray.nodes())
+
+
 def wait_for(condition: Callable[[], bool], what: str) -> None:
     service.wait_for(condition, what, timeout_s=120)
 
@@ -52,10 +61,13 @@ def test_actors_spread_over_nodes_that_come_and_go(cluster: Cluster) -> None:
         wait_for(lambda: crowds(fleet) == [ACTORS], "all actors on the only node")
         second = cluster.add_node(**node)
         wait_for(lambda: crowds(fleet) == [ACTORS // 2] * 2, "half of the actors on the new node")
-        moved = {member.name: member.incarnation for member in fleet._members}
-        assert sum(moved.values()) == ACTORS // 2
-        cluster.remove_node(second)
+        assert incarnations(fleet) == ACTORS // 2, "each of them is moved once"
+        lost = second.node_id
+        cluster.remove_node(second, allow_graceful=False)
         wait_for(lambda: crowds(fleet) == [ACTORS], "all actors on the node that is left")
+        # For some seconds Ray still lists the node, as an empty one.
+        wait_for(lambda: not alive(lost), "Ray to see that the node is lost")
+        assert incarnations(fleet) == ACTORS // 2 + ACTORS // 2, "each of the lost ones is started once"
     finally:
         fleet.stop()
         thread.join(30)

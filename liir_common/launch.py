@@ -100,11 +100,12 @@ class Service(ABC):
         code, words = self.exit_code or 0, self.last_words()
         how = signal.Signals(-code).name if code < 0 else meaning(code)
         phase = self.phase or (_EVENT.findall(words) or ["starting"])[-1]
-        exceptions = _EXCEPTION.findall(words) or ["none in its log"]
-        lines = "\n".join(words.splitlines()[-_LAST_LINES:])
+        exception = (_EXCEPTION.findall(words) or ["none in its log"])[-1]
+        lines = [line for line in words.splitlines() if line != exception][-_LAST_LINES:]
+        rest = "\n".join(["ends with", *lines]) if lines else "has no more"
         return (
             f"the {self.name} ended with code {code} ({how}) in the phase {phase!r}; "
-            f"last exception: {exceptions[-1]}; {self.log_path} ends with\n{lines}"
+            f"last exception: {exception.removeprefix('error: ')}; {self.log_path} {rest}"
         )
 
     def may_restart(self) -> bool:

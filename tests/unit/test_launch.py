@@ -49,7 +49,7 @@ class Program(LocalService):
         ("{}[7]", ["code 1 (an error that is not foreseen)", "'tested'", "last exception: KeyError: 7;"]),
         (
             "with exit_on_error():\n    raise StorageError('no room')",
-            ["code 6 (The run directory cannot be written to)", "last exception: error: no room;"],
+            ["code 6 (The run directory cannot be written to)", "last exception: no room;"],
         ),
         (
             "os.kill(os.getpid(), signal.SIGKILL)",
@@ -68,6 +68,14 @@ def test_an_obituary_has_code_phase_exception_and_log(tmp_path: Path, last: str,
     for part in parts:
         assert part in text
     assert "incarnation before" not in text
+
+
+def test_an_obituary_says_nothing_twice(tmp_path: Path) -> None:
+    service = Program("learner", ["raise SystemExit('error: unknown map')"], tmp_path)
+    service.start()
+    wait_for(lambda: service.exit_code is not None, "the end of the program")
+    assert service.obituary().count("unknown map") == 1
+    assert service.obituary().endswith(f"last exception: unknown map; {service.log_path} has no more")
 
 
 def test_what_the_learner_said_of_itself_counts_more_than_its_log(tmp_path: Path) -> None:

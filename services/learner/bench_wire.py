@@ -11,6 +11,7 @@ import time
 from collections.abc import AsyncIterator, Iterable, Iterator, MutableSequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
+from multiprocessing.context import SpawnProcess
 from statistics import median
 from typing import Any, NamedTuple
 
@@ -86,18 +87,26 @@ async def _intake(settings: config.Config, streams: int, tickets: int) -> AsyncI
         spawn.Process(target=_client, args=(address, spec.hash, tickets, episode, shared, i), daemon=True)
         for i in range(streams)
     ]
-    for client in clients:
-        client.start()
     try:
+        # In a thread: gRPC cancels the calls of those that are there while the loop stands still.
+        await asyncio.to_thread(_start, clients)
         while service.actors < streams:
+            if any(client.exitcode for client in clients):
+                raise RuntimeError("a client died before all had joined; its error is above")
             await asyncio.sleep(0.1)
         weights = random_weights(spec, settings.algorithm.policy_hidden, seed=0)
         yield _Intake(service, delivered, weights, shared)
         await service.drain("measured", run_complete=True, grace_s=5.0)
     finally:
         for client in clients:
-            client.terminate()
+            if client.pid is not None:
+                client.terminate()
         await server.stop(0)
+
+
+def _start(clients: Iterable[SpawnProcess]) -> None:
+    for client in clients:
+        client.start()
 
 
 def bench_wire(map_name: str, streams: int = 4, batches: int = 40, repeats: int = 5) -> dict[str, Any]:

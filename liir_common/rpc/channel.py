@@ -18,7 +18,7 @@ DEADLINE_S = 10.0
 """Of every unary call."""
 AWAY = (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.DEADLINE_EXCEEDED, grpc.StatusCode.CANCELLED)
 """Codes that tell of the connection, not of the call: to try again may help. No client here cancels a call:
-CANCELLED comes from a learner that ends in the middle of it."""
+gRPC does so for a learner that did not get to it within half a minute."""
 KEEPALIVE_MS, KEEPALIVE_TIMEOUT_MS = 5_000, 7_000
 """A peer that answers no ping is given up after at most their sum."""
 KEEPALIVE_OPTIONS = (

@@ -55,6 +55,8 @@ class _Intake:
     delivered: queue.SimpleQueue[list[Trajectory] | None]
     weights: Weights
     shared: _Shared
+    episode_bytes: int
+    """Of the episode that answers every ticket"""
     opened: int = 0
 
     def open(self, policy_version: int = 0) -> None:
@@ -88,14 +90,14 @@ async def _intake(settings: config.Config, streams: int, tickets: int) -> AsyncI
         for i in range(streams)
     ]
     try:
-        # In a thread: gRPC cancels the calls of those that are there while the loop stands still.
+        # In a thread: gRPC cancels calls that wait half a minute for a loop that stands still.
         await asyncio.to_thread(_start, clients)
         while service.actors < streams:
             if any(client.exitcode for client in clients):
                 raise RuntimeError("a client died before all had joined; its error is above")
             await asyncio.sleep(0.1)
         weights = random_weights(spec, settings.algorithm.policy_hidden, seed=0)
-        yield _Intake(service, delivered, weights, shared)
+        yield _Intake(service, delivered, weights, shared, len(episode))
         await service.drain("measured", run_complete=True, grace_s=5.0)
     finally:
         for client in clients:
@@ -115,7 +117,7 @@ def bench_wire(map_name: str, streams: int = 4, batches: int = 40, repeats: int 
     per_repeat = batches * settings.training.batch_episodes
     keep_memory()
 
-    async def measure() -> tuple[list[float], list[float]]:
+    async def measure() -> tuple[list[float], list[float], int]:
         rates, costs = [], []
         async with _intake(settings, streams, _tickets(settings)) as intake:
             for _ in range(_AHEAD):
@@ -128,10 +130,9 @@ def bench_wire(map_name: str, streams: int = 4, batches: int = 40, repeats: int 
                 if repeat:  # the first is the warm-up
                     rates.append(per_repeat / (time.perf_counter() - begin))
                     costs.append((time.process_time() - cpu) / per_repeat)
-        return rates, costs
+            return rates, costs, intake.episode_bytes
 
-    rates, costs = asyncio.run(measure())
-    size = _episode(settings).ByteSize()
+    rates, costs, size = asyncio.run(measure())
     return {
         "map": map_name,
         "streams": streams,

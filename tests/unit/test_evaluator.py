@@ -66,7 +66,7 @@ def evaluate(method: str, *codes: grpc.StatusCode) -> int:
 
 @pytest.mark.parametrize("method", ["GetRun", "ListEvaluations", "WatchCheckpoints"])
 def test_a_learner_that_is_away_is_waited_for(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """CANCELLED is what a call comes to whose learner ends in the middle of it."""
+    """CANCELLED is what a call comes to that a learner did not get to within half a minute."""
     monkeypatch.setattr("services.evaluator.evaluator.backoffs", lambda: repeat(0.0))
     codes = (grpc.StatusCode.CANCELLED, grpc.StatusCode.DEADLINE_EXCEEDED, grpc.StatusCode.CANCELLED)
     assert evaluate(method, *codes) == 0

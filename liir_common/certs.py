@@ -31,7 +31,8 @@ from liir_common.rpc.tokens import Role, Tokens
 
 LOCAL_HOSTS = ("localhost", "127.0.0.1", "::1")
 _CA_DAYS, _DAYS = 3650, 365
-_CLOCK_SKEW = timedelta(minutes=5)
+_CLOCK_SKEW = timedelta(days=2)
+"""New certificates hold for a machine whose clock is as much slow."""
 _PRIVATE = 0o600
 _TOKEN_BYTES = 32
 

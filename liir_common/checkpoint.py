@@ -159,8 +159,7 @@ class CheckpointStore:
             KeyError: there is no such checkpoint.
         """
         manifest = self.find(episode)
-        deleted_path = f"{self._root}/deleted-{episode:09d}-{manifest.sha256}.json"
-        self._fs.mv(self._manifest_path(episode), deleted_path)
+        self._fs.mv(self._manifest_path(episode), f"{self._root}/{_deleted_name(episode, manifest.sha256)}")
         with self._lock:
             self._deleted[episode] = manifest.sha256
             self._manifests = [other for other in self._manifests if other.episode != episode]
@@ -186,6 +185,20 @@ class CheckpointStore:
             raise KeyError(f"checkpoint {episode} was deleted, as the run's section checkpoints wants it")
         raise KeyError(f"no checkpoint of episode {episode}")
 
+    def check_all(self, episodes: Iterable[int]) -> None:
+        """See that the checkpoints of these episodes are there or were deleted.
+
+        Raises:
+            CorruptError: some are neither.
+        """
+        known = {manifest.episode for manifest in self._manifests} | self._deleted.keys()
+        if missing := [episode for episode in episodes if episode not in known]:
+            raise CorruptError(
+                f"{len(missing)} checkpoints, from {missing[0]} on, are missing under {self._root}; restore "
+                f"them from a backup, or make an empty file {_deleted_name(missing[0], 'lost')} there for "
+                "each to go on without them"
+            )
+
     def read(self, manifest: Manifest) -> bytes:
         """The weights file, checked.
 
@@ -200,7 +213,10 @@ class CheckpointStore:
         try:
             return Manifest.from_json(self._fs.cat_file(path).decode())
         except (CorruptError, UnicodeDecodeError) as error:
-            raise CorruptError(f"{path}: {error}; remove it to go on without that checkpoint") from None
+            name = re.sub(r".*-(\d+)\.json", r"deleted-\1-lost.json", path)
+            raise CorruptError(
+                f"{path}: {error}; restore it from a backup, or rename it to {name} to go on without it"
+            ) from None
 
     def _weights_path(self, episode: int) -> str:
         return f"{self._root}/checkpoint-{episode:09d}.safetensors"
@@ -214,6 +230,10 @@ class CheckpointStore:
         else:
             # Object stores show an object when it is complete.
             self._fs.pipe_file(path, data)
+
+
+def _deleted_name(episode: int, sha256: str) -> str:
+    return f"deleted-{episode:09d}-{sha256}.json"
 
 
 def _episodes(names: Iterable[str], form: str) -> set[int]:

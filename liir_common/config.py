@@ -255,6 +255,8 @@ class LearnerConfig(Section):
     """Of a learner step; actors play beside most of it, so more pay only where cores are idle then."""
     insecure: bool = False
     """Serve plaintext on an address that is not loopback."""
+    stay: bool = False
+    """Serve a complete run's checkpoints, too, until asked to end; actors and evaluator wait meanwhile."""
 
 
 class EvaluationConfig(Section):

@@ -22,6 +22,7 @@ _PHASES = {
     training_pb2.PHASE_UPDATING: "learner updates",
     training_pb2.PHASE_EVALUATING: "last checkpoints are tested",
     training_pb2.PHASE_STOPPING: "stopping",
+    training_pb2.PHASE_COMPLETE: "complete",
 }
 
 

@@ -103,6 +103,18 @@ def stop(
 
 
 @app.command()
+def backup(
+    run_dir: Annotated[Path, typer.Option("--run-dir", help="Run directory; the run may go on meanwhile.")],
+) -> None:
+    """Write a run to standard output, as a tar.gz from which it can be resumed."""
+    from liir_common.backup import back_up
+
+    if sys.stdout.isatty():
+        raise ConfigError("an archive is not for a terminal; send it on, as in `liir backup … > run.tar.gz`")
+    back_up(run_dir, sys.stdout.buffer)
+
+
+@app.command()
 def certs(
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write into.")] = Path("certs"),
     hosts: Annotated[

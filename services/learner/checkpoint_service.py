@@ -109,7 +109,7 @@ class CheckpointService(checkpoint_pb2_grpc.CheckpointServiceServicer):
             if self._complete:
                 return
             if self._ended:
-                raise Refused(grpc.StatusCode.UNAVAILABLE, "the learner ends before the run is complete")
+                raise Refused(grpc.StatusCode.UNAVAILABLE, "the learner ends; watch again when it is back")
             async with self._changed:
                 # The trainer publishes before it notifies, so this cannot sleep through a checkpoint.
                 if not self._first_after(seen) and not self._ended:

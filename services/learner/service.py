@@ -39,7 +39,10 @@ _STOP_GRACE_S = 2.0
 
 
 async def serve(config: Config, run: RunDirectory, spec: EnvSpec) -> None:
-    """Train until the run is complete and its checkpoints are tested, or until asked to stop."""
+    """Train until the run is complete and its checkpoints are tested, or until asked to stop.
+
+    With `learner.stay` only the latter ends it.
+    """
     keep_memory()
     server = Server(
         config.learner.host, config.learner.port, config.security, insecure=config.learner.insecure
@@ -100,11 +103,16 @@ async def _train(run: RunDirectory, algorithm: Algorithm, server: Server) -> Non
         if trainer.complete and config.evaluation.enabled and not stopping.is_set():
             trainer.progress.phase = training_pb2.PHASE_EVALUATING
             await _first_of(checkpoints.wait_all_evaluated(), stopping.wait(), expiry, on_loop.failure)
+        if trainer.complete and config.learner.stay:
+            trainer.progress.phase = training_pb2.PHASE_COMPLETE
+            await _first_of(stopping.wait(), expiry, on_loop.failure)
     finally:
         trainer.stop()
         expiry.cancel()
         await asyncio.wait([learning])  # which saves the state, with the algorithm that is still there
-        await _leave(server, trainer, rollouts, checkpoints)
+        # One that stays is missed when it goes: its peers wait for it to come back.
+        over = trainer.complete and not config.learner.stay
+        await _leave(server, trainer, rollouts, checkpoints, over)
 
 
 class _OnLoop:
@@ -128,13 +136,13 @@ class _OnLoop:
 
 
 async def _leave(
-    server: Server, trainer: Trainer, rollouts: RolloutService, checkpoints: CheckpointService
+    server: Server, trainer: Trainer, rollouts: RolloutService, checkpoints: CheckpointService, over: bool
 ) -> None:
-    """Say goodbye in the order that lets every peer end cleanly."""
+    """Say goodbye in the order that lets every peer end cleanly, for good if it is `over`."""
     trainer.progress.phase = training_pb2.PHASE_STOPPING
     await server.not_serving()
-    await rollouts.drain("the learner ends", trainer.complete, _DRAIN_GRACE_S)
-    await checkpoints.end(trainer.complete)
+    await rollouts.drain("the learner ends", over, _DRAIN_GRACE_S)
+    await checkpoints.end(over)
     await server.stop(_STOP_GRACE_S)
     log.info("ended", run_complete=trainer.complete, learner_step=trainer.progress.counters.learner_step)
 

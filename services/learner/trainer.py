@@ -283,6 +283,9 @@ class Trainer:
                 self._openings.append((Opening(batch, 0, epsilon), self.algorithm.policy()))
         else:
             _, arrays, notes = saved
+            interval = self.config.training.checkpoint_interval
+            # Nobody comes to these again, so one that is lost would be a gap that nobody notices.
+            self.run_directory.checkpoints.check_all(range(interval, counters.episodes + 1, interval))
             try:
                 self.algorithm.load_state(_section(arrays, "algorithm."))
             except ValueError as error:

@@ -7,6 +7,7 @@ import json
 import queue
 import re
 import socket
+import subprocess
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -35,7 +36,7 @@ from liir_common.rollout.play import make_player
 from liir_common.rollout.player import Player
 from liir_common.rpc import codec
 from liir_common.rpc.channel import CHANNEL_OPTIONS, connect
-from liir_common.rpc.gen.liir.v1 import checkpoint_pb2, rollout_pb2, rollout_pb2_grpc
+from liir_common.rpc.gen.liir.v1 import checkpoint_pb2, rollout_pb2, rollout_pb2_grpc, training_pb2
 from liir_common.rpc.tokens import Role
 from liir_common.types import Exploration, Ticket, Trajectory, Weights, policy_shapes
 from services.evaluator.evaluator import Evaluator
@@ -552,8 +553,46 @@ def test_a_learner_that_ends_lets_nobody_in_and_cuts_nobody_off(tmp_path: Path) 
         with pytest.raises(grpc.RpcError) as caught:
             next(watched)
         assert caught.value.code() == grpc.StatusCode.UNAVAILABLE
-        assert "before the run is complete" in str(caught.value.details())
+        assert "when it is back" in str(caught.value.details())
     assert "Traceback" not in service.finish(process)
+
+
+def test_a_learner_that_stays_serves_a_complete_run_and_takes_more_steps(tmp_path: Path) -> None:
+    """Nobody is sent home for good: an actor and a watcher wait, and the run may be given more steps."""
+    run_dir = tmp_path / "run"
+    settings = ("training.batch_episodes=4", "training.checkpoint_interval=4", "learner.stay=true")
+
+    def start(*more: str) -> tuple[subprocess.Popen[str], str]:
+        options = ("--resume-if-begun", "--run-dir", str(run_dir), *service.arguments((*settings, *more)))
+        process = service.start("learner", *options)
+        service.wait_for((run_dir / "endpoints.json").exists, "the learner's start")
+        return process, service.endpoints(run_dir)["address"]
+
+    process, address = start("training.total_env_steps=1")
+    play_batches(address, 1)
+    with Actor(address) as actor, CheckpointClient(address) as client, TrainingClient(address) as training:
+        watched = client.watch()
+        client.report(evaluation_of(next(watched), wins=3))
+        complete = training_pb2.PHASE_COMPLETE
+        service.wait_for(lambda: training.status().phase == complete, "the complete run")
+        assert client.get(4)
+        actor.ask()
+        training.stop("test")
+        message = actor.receive()
+        assert message.HasField("drain")
+        assert not message.drain.run_complete
+        actor.leave()
+        with pytest.raises(grpc.RpcError) as caught:
+            next(watched)
+        assert caught.value.code() == grpc.StatusCode.UNAVAILABLE
+    service.finish(process)
+    (run_dir / "endpoints.json").unlink()
+    process, address = start("training.total_env_steps=1000000")
+    with Actor(address) as actor:
+        actor.ask()
+        assert actor.order().episode_id == 4
+    process.terminate()
+    service.finish(process)
 
 
 def test_the_evaluator_tests_what_has_no_test_and_ends_with_the_run(tmp_path: Path) -> None:

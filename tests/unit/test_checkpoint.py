@@ -1,5 +1,6 @@
 """Frozen checkpoints: immutable, digested, there completely or not at all."""
 
+import re
 from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
@@ -77,9 +78,16 @@ def test_a_damaged_weights_file_is_never_read(store: CheckpointStore, tmp_path: 
 
 def test_a_damaged_manifest_is_named(store: CheckpointStore, tmp_path: Path) -> None:
     store.publish(make_manifest(100), DATA)
-    (tmp_path / "checkpoints" / "checkpoint-000000100.json").write_text("{")
-    with pytest.raises(CorruptError, match=r"checkpoint-000000100\.json"):
-        CheckpointStore(str(tmp_path / "checkpoints"))
+    path = tmp_path / "checkpoints" / "checkpoint-000000100.json"
+    path.write_text("{")
+    with pytest.raises(CorruptError, match=r"checkpoint-000000100\.json") as caught:
+        CheckpointStore(str(path.parent))
+    advice = re.search(r"rename it to (\S+)", str(caught.value))
+    assert advice
+    path.rename(path.with_name(advice[1]))
+    again = CheckpointStore(str(path.parent))
+    assert (again.manifests, again.frozen) == ([], 1)
+    again.check_all([100])
 
 
 def test_weights_without_a_manifest_do_not_exist(store: CheckpointStore, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -254,6 +255,19 @@ def test_a_crash_in_front_of_any_write_changes_nothing(
             crashed.train()
     Played(tmp_path, 4, *CRASHING).train()
     assert left_behind(tmp_path) == left_behind(undisturbed)
+
+
+def test_a_run_without_all_its_checkpoints_is_not_resumed_unless_told_to(tmp_path: Path) -> None:
+    settings = ("training.checkpoint_interval=4", "training.save_interval=1")
+    Played(tmp_path, 3, *settings).train()
+    for path in (tmp_path / "checkpoints").glob("checkpoint-000000008.*"):
+        path.unlink()
+    with pytest.raises(CorruptError, match="1 checkpoints, from 8 on, are missing") as caught:
+        Played(tmp_path, 4, *settings)
+    advice = re.search(r"empty file (\S+)", str(caught.value))
+    assert advice
+    (tmp_path / "checkpoints" / advice[1]).touch()
+    assert list(Played(tmp_path, 4, *settings).train().digests()) == [4, 12, 16]
 
 
 def test_stop_ends_a_trainer_that_waits(tmp_path: Path) -> None:

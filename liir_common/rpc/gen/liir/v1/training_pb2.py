@@ -24,7 +24,7 @@ _sym_db = _symbol_database.Default()
 
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x16liir/v1/training.proto\x12\x07liir.v1\"\x0f\n\rGetRunRequest\"[\n\x0eGetRunResponse\x12\x0e\n\x06run_id\x18\x01 \x01(\t\x12\x13\n\x0b\x63onfig_json\x18\x02 \x01(\t\x12\x15\n\renv_spec_hash\x18\x03 \x01(\t\x12\r\n\x05\x62uild\x18\x04 \x01(\t\"\x12\n\x10GetStatusRequest\"\xe5\x02\n\x11GetStatusResponse\x12\x1d\n\x05phase\x18\x01 \x01(\x0e\x32\x0e.liir.v1.Phase\x12\x14\n\x0clearner_step\x18\x02 \x01(\x04\x12\x11\n\tenv_steps\x18\x03 \x01(\x04\x12\x17\n\x0ftotal_env_steps\x18\x04 \x01(\x04\x12\x10\n\x08\x65pisodes\x18\x05 \x01(\x04\x12\x0e\n\x06\x61\x63tors\x18\x06 \x01(\r\x12\x1b\n\x13tickets_outstanding\x18\x07 \x01(\r\x12\x13\n\x0b\x63heckpoints\x18\x08 \x01(\r\x12\x13\n\x0b\x65valuations\x18\t \x01(\r\x12\x1c\n\x14\x65nv_steps_per_second\x18\n \x01(\x01\x12\x38\n\x07metrics\x18\x0b \x03(\x0b\x32\'.liir.v1.GetStatusResponse.MetricsEntry\x1a.\n\x0cMetricsEntry\x12\x0b\n\x03key\x18\x01 \x01(\t\x12\r\n\x05value\x18\x02 \x01(\x01:\x02\x38\x01\"\x1d\n\x0bStopRequest\x12\x0e\n\x06reason\x18\x01 \x01(\t\"\x0e\n\x0cStopResponse*r\n\x05Phase\x12\x15\n\x11PHASE_UNSPECIFIED\x10\x00\x12\x14\n\x10PHASE_COLLECTING\x10\x01\x12\x12\n\x0ePHASE_UPDATING\x10\x02\x12\x14\n\x10PHASE_EVALUATING\x10\x03\x12\x12\n\x0ePHASE_STOPPING\x10\x04\x32\xc5\x01\n\x0fTrainingService\x12\x39\n\x06GetRun\x12\x16.liir.v1.GetRunRequest\x1a\x17.liir.v1.GetRunResponse\x12\x42\n\tGetStatus\x12\x19.liir.v1.GetStatusRequest\x1a\x1a.liir.v1.GetStatusResponse\x12\x33\n\x04Stop\x12\x14.liir.v1.StopRequest\x1a\x15.liir.v1.StopResponseb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x16liir/v1/training.proto\x12\x07liir.v1\"\x0f\n\rGetRunRequest\"[\n\x0eGetRunResponse\x12\x0e\n\x06run_id\x18\x01 \x01(\t\x12\x13\n\x0b\x63onfig_json\x18\x02 \x01(\t\x12\x15\n\renv_spec_hash\x18\x03 \x01(\t\x12\r\n\x05\x62uild\x18\x04 \x01(\t\"\x12\n\x10GetStatusRequest\"\xe5\x02\n\x11GetStatusResponse\x12\x1d\n\x05phase\x18\x01 \x01(\x0e\x32\x0e.liir.v1.Phase\x12\x14\n\x0clearner_step\x18\x02 \x01(\x04\x12\x11\n\tenv_steps\x18\x03 \x01(\x04\x12\x17\n\x0ftotal_env_steps\x18\x04 \x01(\x04\x12\x10\n\x08\x65pisodes\x18\x05 \x01(\x04\x12\x0e\n\x06\x61\x63tors\x18\x06 \x01(\r\x12\x1b\n\x13tickets_outstanding\x18\x07 \x01(\r\x12\x13\n\x0b\x63heckpoints\x18\x08 \x01(\r\x12\x13\n\x0b\x65valuations\x18\t \x01(\r\x12\x1c\n\x14\x65nv_steps_per_second\x18\n \x01(\x01\x12\x38\n\x07metrics\x18\x0b \x03(\x0b\x32\'.liir.v1.GetStatusResponse.MetricsEntry\x1a.\n\x0cMetricsEntry\x12\x0b\n\x03key\x18\x01 \x01(\t\x12\r\n\x05value\x18\x02 \x01(\x01:\x02\x38\x01\"\x1d\n\x0bStopRequest\x12\x0e\n\x06reason\x18\x01 \x01(\t\"\x0e\n\x0cStopResponse*\x86\x01\n\x05Phase\x12\x15\n\x11PHASE_UNSPECIFIED\x10\x00\x12\x14\n\x10PHASE_COLLECTING\x10\x01\x12\x12\n\x0ePHASE_UPDATING\x10\x02\x12\x14\n\x10PHASE_EVALUATING\x10\x03\x12\x12\n\x0ePHASE_STOPPING\x10\x04\x12\x12\n\x0ePHASE_COMPLETE\x10\x05\x32\xc5\x01\n\x0fTrainingService\x12\x39\n\x06GetRun\x12\x16.liir.v1.GetRunRequest\x1a\x17.liir.v1.GetRunResponse\x12\x42\n\tGetStatus\x12\x19.liir.v1.GetStatusRequest\x1a\x1a.liir.v1.GetStatusResponse\x12\x33\n\x04Stop\x12\x14.liir.v1.StopRequest\x1a\x15.liir.v1.StopResponseb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -33,8 +33,8 @@ if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
   _globals['_GETSTATUSRESPONSE_METRICSENTRY']._loaded_options = None
   _globals['_GETSTATUSRESPONSE_METRICSENTRY']._serialized_options = b'8\001'
-  _globals['_PHASE']._serialized_start=572
-  _globals['_PHASE']._serialized_end=686
+  _globals['_PHASE']._serialized_start=573
+  _globals['_PHASE']._serialized_end=707
   _globals['_GETRUNREQUEST']._serialized_start=35
   _globals['_GETRUNREQUEST']._serialized_end=50
   _globals['_GETRUNRESPONSE']._serialized_start=52
@@ -49,6 +49,6 @@ if not _descriptor._USE_C_DESCRIPTORS:
   _globals['_STOPREQUEST']._serialized_end=554
   _globals['_STOPRESPONSE']._serialized_start=556
   _globals['_STOPRESPONSE']._serialized_end=570
-  _globals['_TRAININGSERVICE']._serialized_start=689
-  _globals['_TRAININGSERVICE']._serialized_end=886
+  _globals['_TRAININGSERVICE']._serialized_start=710
+  _globals['_TRAININGSERVICE']._serialized_end=907
 # @@protoc_insertion_point(module_scope)

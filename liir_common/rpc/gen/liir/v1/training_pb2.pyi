@@ -14,11 +14,13 @@ class Phase(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     PHASE_UPDATING: _ClassVar[Phase]
     PHASE_EVALUATING: _ClassVar[Phase]
     PHASE_STOPPING: _ClassVar[Phase]
+    PHASE_COMPLETE: _ClassVar[Phase]
 PHASE_UNSPECIFIED: Phase
 PHASE_COLLECTING: Phase
 PHASE_UPDATING: Phase
 PHASE_EVALUATING: Phase
 PHASE_STOPPING: Phase
+PHASE_COMPLETE: Phase
 
 class GetRunRequest(_message.Message):
     __slots__ = ()

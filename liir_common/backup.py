@@ -1,0 +1,73 @@
+"""`liir backup`: a copy of a run that may go on meanwhile, from which the run can be resumed.
+
+A state counts checkpoints and learner steps and needs episodes of the replay, and a checkpoint is deleted only
+after its test is in evaluations.csv. So the state is read first and the tables last: what is read later may
+know more, never less, than what counts on it.
+"""
+
+from __future__ import annotations
+
+import io
+import tarfile
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from typing import BinaryIO
+
+from liir_common.config import holds_run
+from liir_common.errors import ConfigError
+
+Member = tuple[Path, BinaryIO]
+
+
+def back_up(run_dir: Path, archive: BinaryIO) -> None:
+    """Write a run, as a folder of its name, to a compressed tar archive.
+
+    Raises:
+        ConfigError: there is no run at `run_dir`.
+    """
+    run_dir = run_dir.absolute()
+    if not holds_run(run_dir):
+        raise ConfigError(f"there is no run at {run_dir}; name the folder that has its run.json")
+    with ExitStack() as stack, tarfile.open(fileobj=archive, mode="w|gz") as tar:
+        for path, file in _members(run_dir, stack):
+            member = tarfile.TarInfo(str(path.relative_to(run_dir.parent)))
+            member.size, member.mtime = file.seek(0, io.SEEK_END), int(time.time())
+            file.seek(0)
+            tar.addfile(member, file)
+
+
+def _members(run_dir: Path, stack: ExitStack) -> Iterator[Member]:
+    yield from _state(run_dir / "state", stack)
+    for name in ("run.json", "config.yaml"):
+        yield run_dir / name, io.BytesIO((run_dir / name).read_bytes())
+    yield from _checkpoints(run_dir / "checkpoints")
+    for path in (run_dir / "metrics.csv", run_dir / "evaluations.csv"):
+        if path.exists():
+            rows = path.read_bytes()
+            # Without a row that is just being written.
+            yield path, io.BytesIO(rows[: rows.rfind(b"\n") + 1])
+
+
+def _state(folder: Path, stack: ExitStack) -> list[Member]:
+    """The saved states with the replay that they need, held open, so that the learner may remove them."""
+    while True:
+        paths = sorted(folder.glob("*.safetensors"))
+        with suppress(FileNotFoundError):
+            files = [stack.enter_context(path.open("rb")) for path in paths]
+            if sorted(folder.glob("*.safetensors")) == paths:  # nothing was saved or removed in between
+                return list(zip(paths, files, strict=True))
+
+
+def _checkpoints(folder: Path) -> Iterator[Member]:
+    """The manifests, of deleted ones, too, and the weights."""
+    seen: set[Path] = set()
+    for _ in range(2):  # what is deleted during the first round has another name in the second
+        manifests = set(folder.glob("*.json")) - seen
+        for manifest in sorted(manifests):
+            # In this order: weights are removed only after their manifest got its other name.
+            for path in (manifest.with_suffix(".safetensors"), manifest):
+                with suppress(FileNotFoundError):
+                    yield path, io.BytesIO(path.read_bytes())
+        seen |= manifests

@@ -1,8 +1,8 @@
 """`liir backup`: a copy of a run that may go on meanwhile, from which the run can be resumed.
 
-A state counts checkpoints and learner steps and needs episodes of the replay, and a checkpoint is deleted only
-after its test is in evaluations.csv. So the state is read first and the tables last: what is read later may
-know more, never less, than what counts on it.
+A state counts checkpoints and learner steps and needs episodes of the replay, and a checkpoint is deleted
+only after its test is in evaluations.csv. So the state is read first and the tables last: what is read later
+may know more, never less, than what counts on it.
 """
 
 from __future__ import annotations

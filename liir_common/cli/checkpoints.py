@@ -61,7 +61,7 @@ def watch_checkpoints(
     config: options.ConfigFile = None,
     settings: options.Settings = None,
 ) -> None:
-    """The same lines as they come, until the run is complete."""
+    """The same lines as they come, until the learner is done: one that stays never is."""
     with _checkpoints(learner, map_name, config, settings) as client:
         for frozen in client.watch(after):
             print(_line(frozen), flush=True)

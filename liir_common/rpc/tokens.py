@@ -140,7 +140,7 @@ class Tokens:
             try:
                 self._read()
             except ConfigError as error:
-                log.error("the tokens file cannot be used; its last good state is", reason=str(error))
+                log.error("the tokens file cannot be used; what it last said still holds", reason=str(error))
         return self._tokens
 
     def _read(self) -> None:

@@ -94,7 +94,8 @@ def learners_place(request: launch.Request, nodes: Mapping[str, Mapping[str, flo
         address = endpoints["address"].rpartition(":")[0]
         if address in nodes:
             return _on(f"node:{address}", nodes)
-        if not list((request.run_dir / "state").glob("*.safetensors")):
+        # Which, unlike the rest, is not copied here at the start.
+        if not (request.run_dir / "state").exists():
             raise LiirError(
                 f"{request.run_dir} is on the disk of {address}, and only {', '.join(nodes)} are in the "
                 "cluster; bring it back, or copy the run directory to the head"

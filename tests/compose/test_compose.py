@@ -128,6 +128,11 @@ class Compose:
         """Start everything and wait until it is healthy."""
         self("up", "--detach", "--wait", "--wait-timeout", "600", "--scale", f"ray-worker={WORKERS}")
 
+    def run_to(self, env_steps: int) -> None:
+        """Give the run so many environment steps in all."""
+        self._environment["LEARNER_ARGS"] = f"--set training.total_env_steps={env_steps}"
+        self.up()
+
     def processes(self, service: str, command: str, index: int = 1) -> list[str]:
         """Ids, inside the container, of the processes whose command line contains `command`."""
         return self("exec", "--index", str(index), service, "python", "-c", FIND, command).split()
@@ -229,8 +234,10 @@ def test_up_deaths_rotations_down_and_up_again(compose: Compose) -> None:
     wait_for(lambda: compose.status().learner_step > before + 5, "learner steps with new tokens")
     wait_for(lambda: query("liir_actors_connected") == ACTORS, "all actors connected with new tokens")
 
-    # A stop is graceful and nothing is lost; nor did a secret reach a log or a container's description.
-    stopped_at = compose.status()
+    # A copy is made while the run goes on. A stop is graceful; nor did a secret reach a log or a container's
+    # description.
+    copied = compose.status()
+    compose.documented("Back up")
     compose("stop")
     containers = [json.loads(line) for line in compose("ps", "--all", "--format", "json").splitlines()]
     exit_codes = {container["Service"]: container["ExitCode"] for container in containers}
@@ -241,8 +248,7 @@ def test_up_deaths_rotations_down_and_up_again(compose: Compose) -> None:
     assert len(secrets) > 30
     assert not [secret for secret in secrets if secret in shown]
 
-    # Up again, from a copy of the runs and with another CA: the same checkpoint comes to who has the new one.
-    compose.documented("Back up")
+    # Up again, from the copy and with another CA: the same checkpoint comes to who has the new one.
     compose("down")
     compose.run(["docker", "volume", "rm", "liir-test_runs"])
     compose.documented("Restore")
@@ -252,8 +258,23 @@ def test_up_deaths_rotations_down_and_up_again(compose: Compose) -> None:
     compose.documented("Fetch a checkpoint")
     assert compose.fetched() == first
     resumed = compose.status()
-    assert resumed.learner_step >= stopped_at.learner_step
-    assert resumed.evaluations >= stopped_at.evaluations > 0
+    assert resumed.learner_step >= copied.learner_step - SETTINGS["LIIR_TRAINING__SAVE_INTERVAL"]
+    assert resumed.evaluations >= copied.evaluations > 0
     wait_for(lambda: compose.status().learner_step > resumed.learner_step + 5, "steps after the resume")
     # Prometheus kept what it saw of the first learner.
     assert query("count(min_over_time(liir_learner_step[1h]) < 5)") == 1
+
+    # A complete run is served, by parts that are not started in vain, and goes on when it gets more steps.
+    parts = ("learner", "actors", "evaluator")
+    restarts = [compose.restarts(service) for service in parts[1:]]
+    compose.run_to(1)
+    complete = training_pb2.PHASE_COMPLETE
+    wait_for(lambda: compose.status().phase == complete, "the run complete")
+    assert compose.status().evaluations == compose.status().checkpoints
+    wait_for(lambda: query("liir_actors_connected") == ACTORS, "all actors waiting")
+    compose.documented("Fetch a checkpoint")
+    assert compose.fetched() == first
+    before = compose.status().learner_step
+    compose.run_to(10**9)
+    wait_for(lambda: compose.status().learner_step > before + 5, "steps of the longer run")
+    assert [compose.restarts(service) for service in parts] == [0, *restarts]

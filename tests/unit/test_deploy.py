@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import re
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
@@ -157,6 +158,15 @@ def test_a_damaged_ray_job_is_found(message: str, job: dict[str, Any]) -> None:
     DAMAGES[message](job["spec"], job["spec"]["rayClusterSpec"]["headGroupSpec"])
     with pytest.raises(jsonschema.ValidationError, match=message):
         check_ray_job(job)
+
+
+def test_every_pod_can_write_where_the_run_is(job: dict[str, Any]) -> None:
+    run_folder = re.search(r"cd (\S+)", job["spec"]["entrypoint"])
+    assert run_folder
+    cluster = job["spec"]["rayClusterSpec"]
+    for group in (cluster["headGroupSpec"], *cluster["workerGroupSpecs"]):
+        (container,) = group["template"]["spec"]["containers"]
+        assert run_folder[1] in [mount["mountPath"] for mount in container["volumeMounts"]]
 
 
 def test_kubernetes_runs_the_ray_that_is_installed(job: dict[str, Any]) -> None:

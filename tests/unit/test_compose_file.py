@@ -34,3 +34,8 @@ def test_nothing_permits_plaintext_and_ports_are_on_loopback() -> None:
     published = [str(port) for service in services().values() for port in service.get("ports", ())]
     assert len(published) == 3
     assert all(port.startswith(("127.0.0.1:", "${LEARNER_ADDRESS:-127.0.0.1}:")) for port in published)
+
+
+def test_a_complete_run_is_known_as_long_as_prometheus_remembers() -> None:
+    (kept,) = (word for word in services()["prometheus"]["command"] if "retention" in word)
+    assert f"[{kept.partition('=')[2]}]" in (ROOT / "deploy/prometheus/rules.yml").read_text()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from grafana_foundation_sdk.builders import common, dashboard, prometheus, stat, timeseries, trend
 from grafana_foundation_sdk.cog.encoder import JSONEncoder
 from grafana_foundation_sdk.models.common import LegendDisplayMode, LegendPlacement
-from grafana_foundation_sdk.models.dashboard import DataSourceRef, DataTransformerConfig
+from grafana_foundation_sdk.models.dashboard import DataSourceRef, DataTransformerConfig, DynamicConfigValue
 
 SOURCE = DataSourceRef(type_val="prometheus", uid="prometheus")
 COLUMNS = 24
@@ -24,17 +24,21 @@ def query(expression: str, legend: str, ref_id: str) -> prometheus.Dataquery:
     )
 
 
-def series(
-    title: str, description: str, unit: str, *queries: tuple[str, str], width: int = 8
-) -> timeseries.Panel:
-    """Figures against time; each query is an expression and the legend of its lines."""
-    legend = (
+def legend() -> common.VizLegendOptions:
+    """The names of the lines, below them."""
+    return (
         common.VizLegendOptions()
         .display_mode(LegendDisplayMode.LIST)
         .placement(LegendPlacement.BOTTOM)
         .show_legend(True)
     )
-    panel = timeseries.Panel().legend(legend).fill_opacity(8)
+
+
+def series(
+    title: str, description: str, unit: str, *queries: tuple[str, str], width: int = 8
+) -> timeseries.Panel:
+    """Figures against time; each query is an expression and the legend of its lines."""
+    panel = timeseries.Panel().legend(legend()).fill_opacity(8)
     for number, (expression, name) in enumerate(queries):
         panel.with_target(query(expression, name, chr(ord("A") + number)))
     return panel.title(title).description(description).unit(unit).datasource(SOURCE).span(width).height(8)
@@ -55,10 +59,16 @@ def figure(title: str, description: str, unit: str, expression: str) -> stat.Pan
 
 
 def win_rate_against_steps() -> trend.Panel:
-    """The paper's curve: the two series are joined on time, then drawn against the one that only grows."""
+    """The paper's curve: the two series are joined on time, then drawn against the one that only grows.
+
+    Grafana draws nothing against figures that repeat, so the steps are there only where they have changed,
+    be it while the learner was gone.
+    """
+    before = "last_over_time(liir_evaluated_env_steps[$__range] offset $__interval)"
     return (
         trend.Panel()
-        .with_target(query("max(liir_evaluated_env_steps)", "environment steps", "A"))
+        .legend(legend())
+        .with_target(query(f"max(liir_evaluated_env_steps != {before})", "environment steps", "A"))
         .with_target(query("max by (map, actions) (liir_win_rate)", "{{map}} {{actions}}", "B"))
         .with_transformation(
             DataTransformerConfig("joinByField", options={"byField": "Time", "mode": "inner"})
@@ -67,9 +77,16 @@ def win_rate_against_steps() -> trend.Panel:
         .x_field("environment steps")
         .title("Win rate against environment steps")
         .description("Wins / episodes of each tested checkpoint. Choose a time range that shows one run.")
-        .unit("percentunit")
-        .min(0)
-        .max(1)
+        # The range is of the win rates alone: the other axis would end at 1, too.
+        .unit("short")
+        .override_by_regexp(
+            "/greedy|sampled/",
+            [
+                DynamicConfigValue("unit", "percentunit"),
+                DynamicConfigValue("min", 0),
+                DynamicConfigValue("max", 1),
+            ],
+        )
         .datasource(SOURCE)
         .span(12)
         .height(9)

@@ -25,7 +25,6 @@ from tests.unit.test_metrics import DASHBOARD, defined
 pytestmark = pytest.mark.prometheus
 
 CONFIG = Path(__file__).parents[2] / "deploy/prometheus"
-RATE_INTERVAL = "10s"
 
 
 def program(name: str) -> str:
@@ -100,17 +99,39 @@ def ask(url: str, path: str, **parameters: str) -> Any:
         return json.load(page)["data"]
 
 
+def lines(url: str, expression: str, begin: float) -> list[list[float]]:
+    """What Grafana gets for a panel of the time since `begin`: the values of each line.
+
+    Twice between two scrapes, so that there are figures that repeat.
+    """
+    end = time.time()
+    variables = {"$__rate_interval": "10s", "$__interval": "500ms", "$__range": f"{end - begin:.0f}s"}
+    for name, value in variables.items():
+        expression = expression.replace(name, value)
+    data = ask(url, "query_range", query=expression, start=str(begin), end=str(end), step="0.5")
+    return [[float(value) for _, value in line["values"]] for line in data["result"]]
+
+
 def is_drawn(url: str, expression: str, begin: float) -> bool:
     """Whether a panel has a point to draw."""
-    expression = expression.replace("$__rate_interval", RATE_INTERVAL)
-    data = ask(url, "query_range", query=expression, start=str(begin), end=str(time.time()), step="1")
-    return any(math.isfinite(float(value)) for line in data["result"] for _, value in line["values"])
+    return any(math.isfinite(value) for line in lines(url, expression, begin) for value in line)
+
+
+def check_ascends(url: str, expression: str, begin: float) -> None:
+    """What a trend panel demands of its x axis, once three checkpoints have been tested."""
+
+    def values() -> list[float]:
+        return lines(url, expression, begin)[0]
+
+    service.wait_for(lambda: len(set(values())) >= 3, "three tested checkpoints")
+    assert (steps := values()) == sorted(set(steps))
 
 
 def test_every_panel_draws_a_real_training(tmp_path: Path) -> None:
     run_dir, begin = tmp_path / "run", time.time()
     panels = json.loads(DASHBOARD.read_text())["panels"]
     expressions = {target["expr"] for panel in panels for target in panel.get("targets", ())}
+    (steps,) = (panel["targets"][0]["expr"] for panel in panels if panel["type"] == "trend")
     with service.training(run_dir, "training.total_env_steps=10000000", "learner.threads=1"):
         service.wait_for(lambda: service.learner_step(run_dir) >= 3, "the third learner step")
         with prometheus(tmp_path, metrics_addresses(run_dir)) as url:
@@ -121,6 +142,7 @@ def test_every_panel_draws_a_real_training(tmp_path: Path) -> None:
                 time.sleep(2)
                 empty = {expression for expression in empty if not is_drawn(url, expression, begin)}
             assert not empty
+            check_ascends(url, steps, begin)
             twice = "count by (__name__) (count by (__name__, job) ({__name__=~'liir_.*'})) > 1"
             assert ask(url, "query", query=twice)["result"] == []
             names = set(ask(url, "label/__name__/values"))

@@ -1,9 +1,11 @@
-"""docker-compose.yml hands each service the certificates and tokens of its role, and no others."""
+"""docker-compose.yml hands each service the certificates, tokens and files that are its own."""
 
 from __future__ import annotations
 
-from pathlib import Path
+import json
+from pathlib import Path, PurePosixPath
 from typing import Any
+from urllib.parse import urlsplit
 
 import yaml
 
@@ -34,6 +36,20 @@ def test_nothing_permits_plaintext_and_ports_are_on_loopback() -> None:
     published = [str(port) for service in services().values() for port in service.get("ports", ())]
     assert len(published) == 3
     assert all(port.startswith(("127.0.0.1:", "${LEARNER_ADDRESS:-127.0.0.1}:")) for port in published)
+
+
+def test_grafana_finds_its_dashboard_and_the_dashboard_its_data() -> None:
+    grafana = services()["grafana"]
+    mounted = {at: ROOT / folder for folder, at, *_ in (line.split(":") for line in grafana["volumes"])}
+    provisioning = mounted["/etc/grafana/provisioning"]
+    (provider,) = yaml.safe_load((provisioning / "dashboards/liir.yml").read_text())["providers"]
+    home = PurePosixPath(grafana["environment"]["GF_DASHBOARDS_DEFAULT_HOME_DASHBOARD_PATH"])
+    assert str(home.parent) == provider["options"]["path"]
+    panels = json.loads((mounted[str(home.parent)] / home.name).read_text())["panels"]
+    (source,) = yaml.safe_load((provisioning / "datasources/prometheus.yml").read_text())["datasources"]
+    queries = [query for panel in panels for query in [panel, *panel.get("targets", ())]]
+    assert {query["datasource"]["uid"] for query in queries if "datasource" in query} == {source["uid"]}
+    assert urlsplit(source["url"]).hostname in services()
 
 
 def test_a_complete_run_is_known_as_long_as_prometheus_remembers() -> None:

@@ -77,6 +77,17 @@ def test_every_metric_is_drawn_and_everything_drawn_exists() -> None:
     assert drawn() - ours == standard | {f"compute_{name}" for name in standard}
 
 
+def test_the_win_rates_of_the_trend_have_names_and_alone_end_at_one() -> None:
+    (trend,) = (panel for panel in json.loads(DASHBOARD.read_text())["panels"] if panel["type"] == "trend")
+    assert trend["options"]["legend"]["showLegend"]
+    assert "max" not in trend["fieldConfig"]["defaults"]  # which would be that of its x axis, too
+    (override,) = trend["fieldConfig"]["overrides"]
+    assert {"id": "max", "value": 1} in override["properties"]
+    matches = re.compile(override["matcher"]["options"].strip("/")).search
+    assert not matches(trend["options"]["xField"])
+    assert all(map(matches, ("3m greedy", "3m sampled")))
+
+
 def test_another_process_can_be_exposed_beside_the_own() -> None:
     registry = metrics.ProcessRegistry()
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as other:

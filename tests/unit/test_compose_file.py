@@ -50,8 +50,3 @@ def test_grafana_finds_its_dashboard_and_the_dashboard_its_data() -> None:
     queries = [query for panel in panels for query in [panel, *panel.get("targets", ())]]
     assert {query["datasource"]["uid"] for query in queries if "datasource" in query} == {source["uid"]}
     assert urlsplit(source["url"]).hostname in services()
-
-
-def test_a_complete_run_is_known_as_long_as_prometheus_remembers() -> None:
-    (kept,) = (word for word in services()["prometheus"]["command"] if "retention" in word)
-    assert f"[{kept.partition('=')[2]}]" in (ROOT / "deploy/prometheus/rules.yml").read_text()

@@ -1,4 +1,4 @@
-"""deploy/cluster.yaml as a user runs it: up, submit, a worker lost and back, finish, down. Needs root."""
+"""deploy/cluster.yaml as a user runs it: up, submit, a machine lost and back, finish, down. Needs root."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ CLUSTER, TRAIN = "deploy/cluster.yaml", "deploy/train.py"
 class Cluster:
     """The user's machine, in the project's folder; a head and a worker with a key of the user's."""
 
-    def __init__(self, folder: Path) -> None:
-        """All three on, no Ray yet."""
+    def __init__(self, folder: Path, workers_gpus: int) -> None:
+        """All three on, no Ray yet, which will be told of so many GPUs that the worker has."""
         self.user, self.head, self.worker = (
             Machine(folder / name, number) for number, name in enumerate(("user", "head", "worker"), start=1)
         )
-        self._give_project()
+        self._give_project(workers_gpus)
         self._give_keys()
         self.user.boot("true", None)
         for machine in (self.head, self.worker):
@@ -64,7 +64,7 @@ class Cluster:
         command = f"ray submit {CLUSTER} {TRAIN} -- --run-dir {RUN} {settings} {' '.join(arguments)}"
         return self.user.start(f"cd liir && {command}", output)
 
-    def _give_project(self) -> None:
+    def _give_project(self, workers_gpus: int) -> None:
         folder = self.user.home / "liir"
         for name in UPLOADED:
             shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
@@ -73,6 +73,7 @@ class Cluster:
         cluster = yaml.safe_load((ROOT / CLUSTER).read_text())
         cluster["provider"] |= {"head_ip": self.head.address, "worker_ips": [self.worker.address]}
         cluster["auth"]["ssh_user"] = "root"
+        cluster["worker_start_ray_commands"][-1] += f" --num-gpus={workers_gpus}"
         # They reach no registry, and have this machine's packages instead.
         cluster["setup_commands"] = [line for line in cluster["setup_commands"] if " -r " not in line]
         assert any("--no-deps" in line for line in cluster["setup_commands"])
@@ -88,12 +89,12 @@ class Cluster:
 
 
 @pytest.fixture
-def cluster(tmp_path: Path) -> Iterator[Cluster]:
-    """Three machines that are on."""
+def cluster(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Cluster]:
+    """Three machines that are on; the worker has as many GPUs as the test's parameter says, or none."""
     missing = [tool for tool in ("sshd", "rsync", "ip") if not shutil.which(tool, path=ENVIRONMENT["PATH"])]
     if missing:
         pytest.fail(f"wants {', '.join(missing)}: apt-get install openssh-server rsync iproute2")
-    cluster = Cluster(tmp_path)
+    cluster = Cluster(tmp_path, getattr(request, "param", 0))
     try:
         yield cluster
     finally:
@@ -190,6 +191,44 @@ def test_up_submit_a_worker_lost_and_back_finish_down(cluster: Cluster, tmp_path
 
     cluster.ray(f"down --yes {CLUSTER}")
     assert processes(cluster.head, "raylet") == 0
+
+
+@pytest.mark.parametrize("cluster", [1], indirect=True)
+def test_a_learner_on_a_machine_with_a_gpu_that_is_lost_and_back(cluster: Cluster, tmp_path: Path) -> None:
+    """Ray is told of a GPU, which is all that decides where the learner is; it computes on the CPU."""
+    cluster.ray(f"up --yes {CLUSTER}")
+    wait_for(lambda: processes(cluster.worker, "raylet/raylet"), "the worker's Ray")
+    run_dir, output = cluster.worker.home / RUN, tmp_path / "submit.log"
+    submitted = cluster.submit(output, "--config configs/3m.yaml --set training.save_interval=5")
+
+    def running() -> int:
+        assert submitted.poll() is None, output.read_text(errors="replace")[-3000:]
+        return learner_step(run_dir)
+
+    wait_for(lambda: running() > 10, "learner steps", 600)
+    assert (learners(cluster), actors(cluster)[1] > 0) == ((0, 1), True)
+    cluster.worker.lose()
+    lost_at = running()
+    time.sleep(45)  # longer than Ray takes to see it
+    assert running() == lost_at
+    assert learners(cluster)[0] == 0, "its run is on the other machine's disk"
+    cluster.worker.boot(SSHD, cluster.user)
+    wait_for(lambda: running() > lost_at + 5, "learner steps beyond those before", 600)
+    assert learners(cluster) == (0, 1)
+    steps = [int(row["learner_step"]) for row in read_table(run_dir / "metrics.csv")]
+    assert steps == list(range(1, len(steps) + 1))
+
+    # Its files are on the head in the end.
+    address = json.loads((run_dir / "endpoints.json").read_text())["address"]
+    cluster.ray(f"exec {CLUSTER} 'liir stop --learner {address} --set security=certs/test/operator'")
+    assert submitted.wait(120) == 0, output.read_text(errors="replace")[-3000:]
+    assert learner_step(cluster.head.home / RUN) == learner_step(run_dir)
+    cluster.ray(f"down --yes {CLUSTER}")
+
+
+def learners(cluster: Cluster) -> tuple[int, int]:
+    """How many learners there are on the head and on the worker."""
+    return processes(cluster.head, "services.learner --"), processes(cluster.worker, "services.learner --")
 
 
 def actors(cluster: Cluster) -> tuple[int, int]:

@@ -32,6 +32,8 @@ SETTINGS = (
     "learner.threads=1",
 )
 CLUSTER, TRAIN = "deploy/cluster.yaml", "deploy/train.py"
+LEARNER = "services.learner --"
+"""In the learner's command line."""
 
 
 class Cluster:
@@ -151,7 +153,7 @@ def test_up_submit_a_worker_lost_and_back_finish_down(cluster: Cluster, tmp_path
 
     # The learner and the evaluator are children of Ray actors, the rollout actors sit on both machines.
     wait_for(lambda: running() > 0, "the first learner step", 600)
-    assert processes(cluster.head, "services.learner --") == 1
+    assert processes(cluster.head, LEARNER) == 1
     assert processes(cluster.head, "ray::Host") + processes(cluster.worker, "ray::Host") == 2
     wait_for(lambda: actors(cluster) == (ACTORS // 2, ACTORS // 2), "actors on both machines")
     wait_for(lambda: (run_dir / "evaluations.csv").exists(), "the first evaluation")
@@ -206,15 +208,15 @@ def test_a_learner_on_a_machine_with_a_gpu_that_is_lost_and_back(cluster: Cluste
         return learner_step(run_dir)
 
     wait_for(lambda: running() > 10, "learner steps", 600)
-    assert (learners(cluster), actors(cluster)[1] > 0) == ((0, 1), True)
+    assert (processes(cluster.head, LEARNER), processes(cluster.worker, LEARNER)) == (0, 1)
     cluster.worker.lose()
     lost_at = running()
     time.sleep(45)  # longer than Ray takes to see it
     assert running() == lost_at
-    assert learners(cluster)[0] == 0, "its run is on the other machine's disk"
+    assert not processes(cluster.head, LEARNER), "its run is on the other machine's disk"
     cluster.worker.boot(SSHD, cluster.user)
     wait_for(lambda: running() > lost_at + 5, "learner steps beyond those before", 600)
-    assert learners(cluster) == (0, 1)
+    assert (processes(cluster.head, LEARNER), processes(cluster.worker, LEARNER)) == (0, 1)
     steps = [int(row["learner_step"]) for row in read_table(run_dir / "metrics.csv")]
     assert steps == list(range(1, len(steps) + 1))
 
@@ -224,11 +226,6 @@ def test_a_learner_on_a_machine_with_a_gpu_that_is_lost_and_back(cluster: Cluste
     assert submitted.wait(120) == 0, output.read_text(errors="replace")[-3000:]
     assert learner_step(cluster.head.home / RUN) == learner_step(run_dir)
     cluster.ray(f"down --yes {CLUSTER}")
-
-
-def learners(cluster: Cluster) -> tuple[int, int]:
-    """How many learners there are on the head and on the worker."""
-    return processes(cluster.head, "services.learner --"), processes(cluster.worker, "services.learner --")
 
 
 def actors(cluster: Cluster) -> tuple[int, int]:

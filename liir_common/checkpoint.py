@@ -8,12 +8,15 @@ read. A store may be a folder or any URL that fsspec knows.
 
 from __future__ import annotations
 
+import bisect
 import hashlib
 import json
 import re
 import threading
+from array import array
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +31,8 @@ from liir_common.files import write_atomic
 from liir_common.types import EnvSpec
 
 Tensors = Mapping[str, NDArray[np.float32]]
+
+_EPISODE = attrgetter("episode")
 
 
 @dataclass(frozen=True)
@@ -113,11 +118,10 @@ class CheckpointStore:
             self._manifests.append(
                 _sharing(self._read_manifest(self._manifest_path(episode)), self._manifests)
             )
-        deleted = filter(None, (re.fullmatch(r"deleted-(\d+)-(\w+)\.json", name) for name in names))
-        self._deleted = {int(match[1]): match[2] for match in deleted if int(match[1]) not in kept}
-        for episode in _episodes(names, r"deleted-(\d+)\.json") - kept:  # as older builds named them
-            self._deleted[episode] = self._read_manifest(f"{self._root}/deleted-{episode:09d}.json").sha256
-        self._left_over = _episodes(names, r"checkpoint-(\d+)\.safetensors") & self._deleted.keys()
+        deleted = _episodes(names, r"deleted-(\d+)(?:-\w+)?\.json") - kept  # older builds put no digest there
+        # Of the many that a long run deletes, a number each is in memory; their names have the digests.
+        self._deleted = array("q", sorted(deleted))
+        self._left_over = _episodes(names, r"checkpoint-(\d+)\.safetensors") & deleted
 
     @property
     def manifests(self) -> list[Manifest]:
@@ -127,7 +131,8 @@ class CheckpointStore:
     @property
     def frozen(self) -> int:
         """How many checkpoints were ever frozen, the deleted ones included."""
-        return len(self._manifests) + len(self._deleted)
+        with self._lock:
+            return len(self._manifests) + len(self._deleted)
 
     def publish(self, manifest: Manifest, data: bytes) -> bool:
         """Write a checkpoint; false if a resumed run came to the same one again, deleted since or not.
@@ -136,8 +141,7 @@ class CheckpointStore:
             CorruptError: a checkpoint of that episode exists with other weights, so this run is not the
                 one that the store belongs to, or is not reproducible.
         """
-        known = {old.episode: old.sha256 for old in self._manifests} | self._deleted
-        sha256 = known.get(manifest.episode, "")
+        sha256 = self._known_digest(manifest)
         if sha256 == manifest.sha256:
             return False
         if sha256:
@@ -149,7 +153,9 @@ class CheckpointStore:
         self._write(self._weights_path(manifest.episode), data)
         self._write(self._manifest_path(manifest.episode), manifest.to_json().encode())
         with self._lock:
-            self._manifests = sorted([*self._manifests, manifest], key=lambda other: other.episode)
+            manifests = self._manifests.copy()
+            bisect.insort(manifests, manifest, key=_EPISODE)
+            self._manifests = manifests
         return True
 
     def delete(self, episode: int) -> None:
@@ -158,10 +164,9 @@ class CheckpointStore:
         Raises:
             KeyError: there is no such checkpoint.
         """
-        manifest = self.find(episode)
-        self._fs.mv(self._manifest_path(episode), f"{self._root}/{_deleted_name(episode, manifest.sha256)}")
+        self._fs.mv(self._manifest_path(episode), self._deleted_path(self.find(episode)))
         with self._lock:
-            self._deleted[episode] = manifest.sha256
+            bisect.insort(self._deleted, episode)
             self._manifests = [other for other in self._manifests if other.episode != episode]
         self._fs.rm(self._weights_path(episode))
 
@@ -178,25 +183,25 @@ class CheckpointStore:
         Raises:
             KeyError: there is none, or none any more.
         """
-        for manifest in self._manifests:
-            if manifest.episode == episode:
-                return manifest
-        if episode in self._deleted:
+        if manifest := self._there(episode):
+            return manifest
+        if self._was_deleted(episode):
             raise KeyError(f"checkpoint {episode} was deleted, as the run's section checkpoints wants it")
         raise KeyError(f"no checkpoint of episode {episode}")
 
-    def check_all(self, episodes: Iterable[int]) -> None:
+    def check_all(self, episodes: Sequence[int]) -> None:
         """See that the checkpoints of these episodes are there or were deleted.
 
         Raises:
             CorruptError: some are neither.
         """
-        known = {manifest.episode for manifest in self._manifests} | self._deleted.keys()
-        if missing := [episode for episode in episodes if episode not in known]:
+        there = [manifest.episode for manifest in self._manifests]
+        missing = np.setdiff1d(episodes, np.concatenate([there, self._deleted]))
+        if missing.size:
             raise CorruptError(
-                f"{len(missing)} checkpoints, from {missing[0]} on, are missing under {self._root}; restore "
-                f"them from a backup, or make an empty file {_deleted_name(missing[0], 'lost')} there for "
-                "each to go on without them"
+                f"{missing.size} checkpoints, from {missing[0]} on, are missing under {self._root}; restore "
+                f"them from a backup, or make an empty file deleted-{missing[0]:09d}-lost.json there for each "
+                "to go on without them"
             )
 
     def read(self, manifest: Manifest) -> bytes:
@@ -208,6 +213,31 @@ class CheckpointStore:
         data: bytes = self._fs.cat_file(self._weights_path(manifest.episode))
         unpack(data, manifest.sha256)
         return data
+
+    def _there(self, episode: int) -> Manifest | None:
+        manifests = self._manifests  # which another thread may replace
+        position = bisect.bisect_left(manifests, episode, key=_EPISODE)
+        at = manifests[position : position + 1]
+        return at[0] if at and at[0].episode == episode else None
+
+    def _was_deleted(self, episode: int) -> bool:
+        with self._lock:
+            position = bisect.bisect_left(self._deleted, episode)
+            return episode in self._deleted[position : position + 1]
+
+    def _known_digest(self, manifest: Manifest) -> str:
+        """SHA-256 of the checkpoint of that episode, there or deleted; empty if there never was one."""
+        # In this order: another thread may delete it in between.
+        if there := self._there(manifest.episode):
+            return there.sha256
+        if not self._was_deleted(manifest.episode):
+            return ""
+        if self._fs.exists(self._deleted_path(manifest)):  # which takes no look through all the names
+            return manifest.sha256
+        for path in self._fs.glob(f"{self._root}/deleted-{manifest.episode:09d}[-.]*json"):
+            named = re.search(r"deleted-\d+-(\w+)\.json$", path)
+            return named[1] if named else self._read_manifest(path).sha256
+        return ""  # somebody has removed it
 
     def _read_manifest(self, path: str) -> Manifest:
         try:
@@ -221,6 +251,9 @@ class CheckpointStore:
     def _weights_path(self, episode: int) -> str:
         return f"{self._root}/checkpoint-{episode:09d}.safetensors"
 
+    def _deleted_path(self, manifest: Manifest) -> str:
+        return f"{self._root}/deleted-{manifest.episode:09d}-{manifest.sha256}.json"
+
     def _manifest_path(self, episode: int) -> str:
         return f"{self._root}/checkpoint-{episode:09d}.json"
 
@@ -230,10 +263,6 @@ class CheckpointStore:
         else:
             # Object stores show an object when it is complete.
             self._fs.pipe_file(path, data)
-
-
-def _deleted_name(episode: int, sha256: str) -> str:
-    return f"deleted-{episode:09d}-{sha256}.json"
 
 
 def _episodes(names: Iterable[str], form: str) -> set[int]:

@@ -38,6 +38,7 @@ from liir_common.rpc.gen.liir.v1 import (
 from liir_common.rpc.tokens import Role
 
 _ERRORS = {grpc.StatusCode.NOT_FOUND: MissingError, grpc.StatusCode.DATA_LOSS: DamagedError}
+Merit = tuple[float, ...]
 _PAGE = 1000
 _DOWNLOAD_TRIES = 5
 """In a row that brought nothing; then a download is given up."""
@@ -235,7 +236,7 @@ class CheckpointClient:
         return manifest
 
 
-def merit(evaluation: checkpoint_pb2.Evaluation) -> tuple[float, ...]:
+def merit(evaluation: checkpoint_pb2.Evaluation) -> Merit:
     """What is greater for a better checkpoint: greedy, then sampled win rate, greedy return, episode."""
     greedy, sampled = evaluation.greedy, evaluation.sampled
     rates = (tested.wins / tested.episodes for tested in (greedy, sampled))

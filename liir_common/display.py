@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections import deque
 from typing import Protocol
 
 import structlog
@@ -31,15 +31,26 @@ def phase_name(status: training_pb2.GetStatusResponse) -> str:
     return _PHASES.get(status.phase, "starting")
 
 
+class WinRates:
+    """What is shown of the evaluations so far, however many there are."""
+
+    def __init__(self) -> None:
+        """None yet."""
+        self.newest: deque[checkpoint_pb2.Evaluation] = deque(maxlen=5)
+        self.best = 0.0
+        """Greedy win rate, of all."""
+
+    def add(self, evaluation: checkpoint_pb2.Evaluation) -> None:
+        """That of the next checkpoint."""
+        self.newest.append(evaluation)
+        self.best = max(self.best, _win_rate(evaluation.greedy))
+
+
 class Display(Protocol):
     """Shows how far a run is."""
 
-    def show(
-        self,
-        status: training_pb2.GetStatusResponse,
-        evaluations: Sequence[checkpoint_pb2.Evaluation],
-    ) -> None:
-        """Show this now; `evaluations` are all so far, oldest first."""
+    def show(self, status: training_pb2.GetStatusResponse, win_rates: WinRates) -> None:
+        """Show this now."""
 
     def close(self) -> None:
         """Leave the terminal as it was."""
@@ -59,11 +70,7 @@ class LivePanel:
         self._live = Live(console=console, refresh_per_second=4, transient=False)
         self._live.start()
 
-    def show(
-        self,
-        status: training_pb2.GetStatusResponse,
-        evaluations: Sequence[checkpoint_pb2.Evaluation],
-    ) -> None:
+    def show(self, status: training_pb2.GetStatusResponse, win_rates: WinRates) -> None:
         """Redraw."""
         table = Table(title=self._title, show_header=False, title_justify="left", min_width=64)
         table.add_column(style="dim")
@@ -71,7 +78,7 @@ class LivePanel:
         table.add_row(
             "progress", ProgressBar(total=status.total_env_steps, completed=status.env_steps, width=44)
         )
-        for name, value in rows(status, evaluations).items():
+        for name, value in rows(status, win_rates).items():
             table.add_row(name, value)
         self._live.update(table)
 
@@ -87,23 +94,17 @@ class LogLines:
         """Begin; the first call of `show` writes a line."""
         self._next = 0.0
 
-    def show(
-        self,
-        status: training_pb2.GetStatusResponse,
-        evaluations: Sequence[checkpoint_pb2.Evaluation],
-    ) -> None:
+    def show(self, status: training_pb2.GetStatusResponse, win_rates: WinRates) -> None:
         """Write a line if it is time for one."""
         if time.monotonic() >= self._next:
             self._next = time.monotonic() + _LINE_EVERY_S
-            log.info("training", **_figures(status, evaluations))
+            log.info("training", **_figures(status, win_rates))
 
     def close(self) -> None:
         """Nothing to undo."""
 
 
-def _figures(
-    status: training_pb2.GetStatusResponse, evaluations: Sequence[checkpoint_pb2.Evaluation]
-) -> dict[str, object]:
+def _figures(status: training_pb2.GetStatusResponse, win_rates: WinRates) -> dict[str, object]:
     """What a log line holds."""
     shown = ("return_mean", "length_mean", "policy_lag", "reward_ratio")
     figures: dict[str, object] = {
@@ -118,16 +119,13 @@ def _figures(
         "evaluations": status.evaluations,
         **{name: round(status.metrics[name], 4) for name in shown if name in status.metrics},
     }
-    if evaluations:
-        newest = evaluations[-1]
-        figures["greedy_win_rate"] = newest.greedy.wins / newest.greedy.episodes
-        figures["sampled_win_rate"] = newest.sampled.wins / newest.sampled.episodes
+    if win_rates.newest:
+        figures["greedy_win_rate"] = _win_rate(win_rates.newest[-1].greedy)
+        figures["sampled_win_rate"] = _win_rate(win_rates.newest[-1].sampled)
     return figures
 
 
-def rows(
-    status: training_pb2.GetStatusResponse, evaluations: Sequence[checkpoint_pb2.Evaluation]
-) -> dict[str, str]:
+def rows(status: training_pb2.GetStatusResponse, win_rates: WinRates) -> dict[str, str]:
     """Names and values of what is shown."""
     newest = status.metrics
     rate, lag = status.env_steps_per_second, newest["policy_lag"]
@@ -137,20 +135,22 @@ def rows(
         "learner step": f"{status.learner_step:,} ({status.episodes:,} episodes, lag {lag:.0f})",
         "return": f"{newest['return_mean']:.2f} over {newest['length_mean']:.0f} steps an episode",
         "intrinsic / extrinsic": f"{newest['reward_ratio']:.3f}" if "reward_ratio" in newest else "–",
-        "win rate": _win_rates(evaluations),
+        "win rate": _win_rates(win_rates),
         "checkpoints": f"{status.evaluations:,} of {status.checkpoints:,} tested",
         "actors": f"{status.actors} ({status.tickets_outstanding} tickets out)",
         "time left": _time_left(status),
     }
 
 
-def _win_rates(evaluations: Sequence[checkpoint_pb2.Evaluation]) -> str:
-    if not evaluations:
+def _win_rates(win_rates: WinRates) -> str:
+    if not win_rates.newest:
         return "no checkpoint tested yet"
-    latest = " ".join(f"{e.greedy.wins / e.greedy.episodes:.0%}" for e in evaluations[-5:])
-    sampled = evaluations[-1].sampled
-    best = max(e.greedy.wins / e.greedy.episodes for e in evaluations)
-    return f"{latest} (best {best:.0%}; sampled {sampled.wins / sampled.episodes:.0%})"
+    latest = " ".join(f"{_win_rate(evaluation.greedy):.0%}" for evaluation in win_rates.newest)
+    return f"{latest} (best {win_rates.best:.0%}; sampled {_win_rate(win_rates.newest[-1].sampled):.0%})"
+
+
+def _win_rate(stats: checkpoint_pb2.EpisodeStats) -> float:
+    return float(stats.wins / stats.episodes)
 
 
 def _time_left(status: training_pb2.GetStatusResponse) -> str:

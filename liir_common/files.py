@@ -10,7 +10,7 @@ import io
 import os
 import re
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -106,39 +106,68 @@ class Table:
     def __init__(self, path: Path) -> None:
         """Go on with the file at `path`, or begin it; nobody else may write to it."""
         self.path = path
-        rows = read_table(path)
-        self._columns = list(rows[0]) if rows else []
-        if rows:
-            # Without the row that a dying process may have left half-written.
-            self._rewrite(rows, self._columns)
+        self.columns: list[str] = []
+        if path.exists():
+            with path.open("r+b") as file:
+                # Without the row that a dying process may have left half-written.
+                file.truncate(sum(len(line) for line in file if line.endswith(b"\n")))
+                file.seek(0)
+                self.columns = _cells(file.readline())
 
     def read(self) -> list[dict[str, str]]:
         """All rows, oldest first."""
         return read_table(self.path)
 
-    def append(self, row: Mapping[str, Any]) -> None:
-        """Add one row, flushed to the operating system; if that fails the file is as before."""
-        new = [column for column in row if column not in self._columns]
+    def scan(self) -> Iterator[tuple[int, dict[str, str]]]:
+        """Where each row begins in the file, and the row: all, oldest first, one in memory at a time."""
+        if self.columns:
+            with self.path.open("rb") as file:
+                start = len(file.readline())
+                for line in file:
+                    if line.strip():
+                        yield start, self._row(line)
+                    start += len(line)
+
+    def read_at(self, starts: Iterable[int]) -> Iterator[dict[str, str]]:
+        """The rows that begin there; wherever a row brings new columns, all others begin elsewhere."""
+        with self.path.open("rb") as file:
+            for start in starts:
+                file.seek(start)
+                yield self._row(file.readline())
+
+    def append(self, row: Mapping[str, Any]) -> int:
+        """Add one row, flushed to the operating system; returns where it begins.
+
+        If that fails no row is lost and none is added.
+        """
+        new = [column for column in row if column not in self.columns]
         if new:
-            self._rewrite(self.read(), [*self._columns, *new])
+            self._rewrite(self.read(), [*self.columns, *new])
         text = io.StringIO()
-        csv.DictWriter(text, self._columns, lineterminator="\n").writerow(row)
-        _append_whole(self.path, text.getvalue().encode())
+        csv.DictWriter(text, self.columns, lineterminator="\n").writerow(row)
+        return _append_whole(self.path, text.getvalue().encode())
 
     def keep(self, column: str, at_most: int) -> None:
         """Drop the rows whose `column` is larger; a resumed run writes them again."""
         rows = self.read()
         kept = [row for row in rows if int(row[column]) <= at_most]
         if len(kept) < len(rows):
-            self._rewrite(kept, self._columns)
+            self._rewrite(kept, self.columns)
+
+    def _row(self, line: bytes) -> dict[str, str]:
+        return dict(zip(self.columns, _cells(line), strict=True))
 
     def _rewrite(self, rows: list[dict[str, str]], columns: list[str]) -> None:
         write_atomic(self.path, csv_text(rows, columns).encode())
-        self._columns = columns
+        self.columns = columns
 
 
-def _append_whole(path: Path, data: bytes) -> None:
-    """Append all of `data` or, where the disk is full, nothing."""
+def _cells(line: bytes) -> list[str]:
+    return next(csv.reader([line.decode()]), [])
+
+
+def _append_whole(path: Path, data: bytes) -> int:
+    """Append all of `data` or, where the disk is full, nothing; returns where it begins."""
     with path.open("ab", buffering=0) as file:
         end = file.seek(0, os.SEEK_END)
         try:
@@ -147,6 +176,7 @@ def _append_whole(path: Path, data: bytes) -> None:
         except OSError:
             file.truncate(end)
             raise
+        return end
 
 
 def csv_text(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] = ()) -> str:

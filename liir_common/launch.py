@@ -24,7 +24,7 @@ from rich.console import Console
 from liir_common import options
 from liir_common.client import CheckpointClient, TrainingClient
 from liir_common.config import Config, SecurityConfig, holds_run
-from liir_common.display import Display, make_display, phase_name
+from liir_common.display import Display, WinRates, make_display, phase_name
 from liir_common.errors import (
     ConfigError,
     CorruptError,
@@ -37,7 +37,6 @@ from liir_common.errors import (
     storage_explained,
 )
 from liir_common.report import print_summary, write_report
-from liir_common.rpc.gen.liir.v1 import checkpoint_pb2
 from liir_common.rpc.tokens import Role
 
 log = structlog.get_logger()
@@ -267,7 +266,7 @@ class Launcher:
     def _watch(self, address: str) -> None:
         console = Console(stderr=True)
         display = make_display(f"LIIR · {self._run_dir}", console)
-        shown: list[checkpoint_pb2.Evaluation] = []
+        win_rates = WinRates()
         try:
             with (
                 TrainingClient(address, security=self._security, role=Role.OPERATOR) as training,
@@ -275,7 +274,7 @@ class Launcher:
             ):
                 while not self._stop_signal and self._learner.exit_code != 0:
                     self._revive()
-                    self._show(display, training, checkpoints, shown)
+                    self._show(display, training, checkpoints, win_rates)
                     time.sleep(_POLL_S)
                 if self._stop_signal:
                     self._stop(training)
@@ -291,13 +290,15 @@ class Launcher:
         display: Display,
         training: TrainingClient,
         checkpoints: CheckpointClient,
-        shown: list[checkpoint_pb2.Evaluation],
+        win_rates: WinRates,
     ) -> None:
         try:
-            shown.extend(checkpoints.evaluations(shown[-1].episode if shown else 0))
+            seen = win_rates.newest[-1].episode if win_rates.newest else 0
+            for evaluation in checkpoints.evaluations(seen):
+                win_rates.add(evaluation)
             status = training.status()
             self._learner.phase = phase_name(status)
-            display.show(status, shown)
+            display.show(status, win_rates)
         except grpc.RpcError as error:
             log.info("the learner does not answer", reason=error.details())
 

@@ -5,15 +5,15 @@ from __future__ import annotations
 import asyncio
 import bisect
 import math
-from collections.abc import AsyncIterator, Mapping, Sequence
-from typing import Any
+from collections.abc import AsyncIterator, Iterator, Sequence
+from contextlib import contextmanager
 
 import grpc
 import structlog
 
 from liir_common import metrics
 from liir_common.checkpoint import Manifest
-from liir_common.errors import CorruptError, StorageError, storage_explained
+from liir_common.errors import CorruptError
 from liir_common.rpc.gen.liir.v1 import checkpoint_pb2, checkpoint_pb2_grpc
 from liir_common.rpc.refused import Refused
 from services.learner.retention import superseded
@@ -36,17 +36,15 @@ class CheckpointService(checkpoint_pb2_grpc.CheckpointServiceServicer):
         self._complete = False
         self._damaged: set[int] = set()
         """Episodes of checkpoints whose files cannot be read, so that no test of them will ever come."""
-        self.evaluations = {
-            evaluation.episode: evaluation for evaluation in map(_from_row, run.evaluations.read())
-        }
+        self.evaluations = run.evaluations
         self._show_evaluations()
         self._delete_superseded()  # a resumed run may have another rule
 
     @property
     def all_evaluated(self) -> bool:
         """Whether every checkpoint so far that can be read has its test."""
-        done = self.evaluations.keys() | self._damaged
-        return all(manifest.episode in done for manifest in self._run.checkpoints.manifests)
+        episodes = (manifest.episode for manifest in self._run.checkpoints.manifests)
+        return all(episode in self.evaluations or episode in self._damaged for episode in episodes)
 
     async def changed(self) -> None:
         """Wake the watchers: there is a new checkpoint or a new evaluation; older ones may go."""
@@ -68,25 +66,21 @@ class CheckpointService(checkpoint_pb2_grpc.CheckpointServiceServicer):
         self, request: checkpoint_pb2.ListCheckpointsRequest, context: grpc.aio.ServicerContext
     ) -> checkpoint_pb2.ListCheckpointsResponse:
         """Checkpoints after a position, oldest first."""
-        found = [m for m in self._run.checkpoints.manifests if m.episode > request.after_episode]
-        return checkpoint_pb2.ListCheckpointsResponse(
-            checkpoints=map(_to_message, found[: _limit(request.limit)])
-        )
+        found = self._after(request.after_episode, _limit(request.limit))
+        return checkpoint_pb2.ListCheckpointsResponse(checkpoints=map(_to_message, found))
 
     async def GetCheckpoint(
         self, request: checkpoint_pb2.GetCheckpointRequest, context: grpc.aio.ServicerContext
     ) -> AsyncIterator[checkpoint_pb2.GetCheckpointResponse]:
         """A header, then the weights file from the asked offset on."""
         manifest = self._find(request.episode)
-        try:
-            data = self._run.checkpoints.read(manifest)
-        except (CorruptError, FileNotFoundError) as error:
-            await self._note_damage(request.episode)
-            message = f"{error}; restore its file from a backup"
-            raise Refused(grpc.StatusCode.DATA_LOSS, message) from None
-        except OSError as error:  # which may pass
-            message = f"checkpoint {request.episode} cannot be read now: {error}"
-            raise Refused(grpc.StatusCode.UNAVAILABLE, message) from None
+        with _passing(f"checkpoint {request.episode} cannot be read now"):
+            try:
+                data = self._run.checkpoints.read(manifest)
+            except (CorruptError, FileNotFoundError) as error:
+                await self._note_damage(request.episode)
+                message = f"{error}; restore its file from a backup"
+                raise Refused(grpc.StatusCode.DATA_LOSS, message) from None
         if request.offset > len(data):
             raise ValueError(f"offset: wanted 0..{len(data)}, got {request.offset}")
         header = checkpoint_pb2.CheckpointHeader(
@@ -103,16 +97,16 @@ class CheckpointService(checkpoint_pb2_grpc.CheckpointServiceServicer):
         seen = request.after_episode
         while True:
             # One at a time: while one is sent, others may come or be deleted.
-            while manifest := self._first_after(seen):
-                yield checkpoint_pb2.WatchCheckpointsResponse(checkpoint=_to_message(manifest))
-                seen = manifest.episode
+            while found := self._after(seen, limit=1):
+                yield checkpoint_pb2.WatchCheckpointsResponse(checkpoint=_to_message(found[0]))
+                seen = found[0].episode
             if self._complete:
                 return
             if self._ended:
                 raise Refused(grpc.StatusCode.UNAVAILABLE, "the learner ends; watch again when it is back")
             async with self._changed:
                 # The trainer publishes before it notifies, so this cannot sleep through a checkpoint.
-                if not self._first_after(seen) and not self._ended:
+                if not self._after(seen, limit=1) and not self._ended:
                     await self._changed.wait()
 
     async def ReportEvaluation(
@@ -120,33 +114,28 @@ class CheckpointService(checkpoint_pb2_grpc.CheckpointServiceServicer):
     ) -> checkpoint_pb2.ReportEvaluationResponse:
         """Store the test of a checkpoint, once."""
         evaluation = request.evaluation
-        if known := self.evaluations.get(evaluation.episode):
-            # Its checkpoint may be deleted by now.
-            _check_digest(evaluation, known.sha256)
-            return checkpoint_pb2.ReportEvaluationResponse(duplicate=True)
-        manifest = self._find(evaluation.episode)
-        _check(evaluation, manifest, self._run.spec.info_keys)
-        try:
-            with storage_explained(self._run.path):
-                self._run.evaluations.append(_to_row(evaluation, manifest, self._run.created))
-        except StorageError as error:
-            # The evaluator keeps trying, and until then the learner does not call the checkpoint tested.
-            raise Refused(grpc.StatusCode.UNAVAILABLE, str(error)) from None
-        self.evaluations[evaluation.episode] = evaluation
-        self._damaged.discard(evaluation.episode)  # its file has been restored
-        self._show_damage()
-        self._show_evaluations()
-        await self.changed()
+        # The evaluator keeps trying, and until then the learner does not call the checkpoint tested.
+        with _passing("evaluations.csv cannot be read or written now"):
+            if evaluation.episode in self.evaluations:
+                # Its checkpoint may be deleted by now.
+                _check_digest(evaluation, self.evaluations[evaluation.episode].sha256)
+                return checkpoint_pb2.ReportEvaluationResponse(duplicate=True)
+            manifest = self._find(evaluation.episode)
+            _check(evaluation, manifest, self._run.spec.info_keys)
+            self.evaluations.add(evaluation, manifest)
+            self._damaged.discard(evaluation.episode)  # its file has been restored
+            self._show_damage()
+            self._show_evaluations()
+            await self.changed()
         return checkpoint_pb2.ReportEvaluationResponse(duplicate=False)
 
     async def ListEvaluations(
         self, request: checkpoint_pb2.ListEvaluationsRequest, context: grpc.aio.ServicerContext
     ) -> checkpoint_pb2.ListEvaluationsResponse:
         """Evaluations after a position, oldest checkpoint first."""
-        episodes = sorted(episode for episode in self.evaluations if episode > request.after_episode)
-        return checkpoint_pb2.ListEvaluationsResponse(
-            evaluations=[self.evaluations[episode] for episode in episodes[: _limit(request.limit)]]
-        )
+        with _passing("evaluations.csv cannot be read now"):
+            found = self.evaluations.after(request.after_episode, _limit(request.limit))
+        return checkpoint_pb2.ListEvaluationsResponse(evaluations=found)
 
     async def _note_damage(self, episode: int) -> None:
         self._damaged.add(episode)
@@ -156,7 +145,7 @@ class CheckpointService(checkpoint_pb2_grpc.CheckpointServiceServicer):
 
     def _show_damage(self) -> None:
         """Those that wait for their test in vain; what has had it lacks nothing but its file."""
-        metrics.CHECKPOINTS_DAMAGED.set(len(self._damaged - self.evaluations.keys()))
+        metrics.CHECKPOINTS_DAMAGED.set(sum(episode not in self.evaluations for episode in self._damaged))
 
     def _find(self, episode: int) -> Manifest:
         try:
@@ -165,14 +154,14 @@ class CheckpointService(checkpoint_pb2_grpc.CheckpointServiceServicer):
             message = f"{error.args[0]}; ListCheckpoints says which there are"
             raise Refused(grpc.StatusCode.NOT_FOUND, message) from None
 
-    def _first_after(self, episode: int) -> Manifest | None:
+    def _after(self, episode: int, limit: int) -> list[Manifest]:
         manifests = self._run.checkpoints.manifests
-        position = bisect.bisect_right(manifests, episode, key=lambda manifest: manifest.episode)
-        return manifests[position] if position < len(manifests) else None
+        begin = bisect.bisect_right(manifests, episode, key=lambda manifest: manifest.episode)
+        return manifests[begin : begin + limit]
 
     def _delete_superseded(self) -> None:
         store = self._run.checkpoints
-        for episode in superseded(store.manifests, self.evaluations, self._run.config):
+        for episode in superseded(store.manifests, self.evaluations.merits, self._run.config):
             try:
                 store.delete(episode)
             except OSError as error:
@@ -181,15 +170,24 @@ class CheckpointService(checkpoint_pb2_grpc.CheckpointServiceServicer):
 
     def _show_evaluations(self) -> None:
         metrics.EVALUATIONS.set(len(self.evaluations))
-        if not self.evaluations:
+        newest = self.evaluations.newest
+        if newest is None:
             return
-        newest = self.evaluations[max(self.evaluations)]
         metrics.EVALUATED_ENV_STEPS.set(newest.env_steps)
         for actions in ("greedy", "sampled"):
             stats = getattr(newest, actions)
             labels = (self._run.config.env.label, actions)
             metrics.WIN_RATE.labels(*labels).set(stats.wins / stats.episodes)
             metrics.EVALUATION_RETURN.labels(*labels).set(stats.return_mean)
+
+
+@contextmanager
+def _passing(trouble: str) -> Iterator[None]:
+    """What the operating system refuses now, it may do later: the caller shall ask again."""
+    try:
+        yield
+    except OSError as error:
+        raise Refused(grpc.StatusCode.UNAVAILABLE, f"{trouble}: {error}") from None
 
 
 def _limit(asked: int) -> int:
@@ -222,41 +220,3 @@ def _check(evaluation: checkpoint_pb2.Evaluation, manifest: Manifest, info_keys:
             raise ValueError(f"{name}: wanted info of {sorted(info_keys)}, got {sorted(stats.info_means)}")
         if not all(map(math.isfinite, (stats.return_mean, stats.length_mean, *stats.info_means.values()))):
             raise ValueError(f"{name}: wanted finite means, got NaN or infinity")
-
-
-def _to_row(evaluation: checkpoint_pb2.Evaluation, manifest: Manifest, begin: float) -> dict[str, Any]:
-    row: dict[str, Any] = {
-        "episode": evaluation.episode,
-        "env_steps": manifest.env_steps,
-        "policy_version": manifest.policy_version,
-        "seconds": manifest.created - begin,
-        "sha256": evaluation.sha256,
-    }
-    for name in ("greedy", "sampled"):
-        stats = getattr(evaluation, name)
-        row |= {
-            f"{name}_episodes": stats.episodes,
-            f"{name}_wins": stats.wins,
-            f"{name}_win_rate": stats.wins / stats.episodes,
-            f"{name}_return_mean": stats.return_mean,
-            f"{name}_length_mean": stats.length_mean,
-        }
-        row |= {f"{name}_{key}_mean": stats.info_means[key] for key in sorted(stats.info_means)}
-    return row
-
-
-def _from_row(row: Mapping[str, str]) -> checkpoint_pb2.Evaluation:
-    evaluation = checkpoint_pb2.Evaluation(
-        episode=int(row["episode"]), sha256=row["sha256"], env_steps=int(row["env_steps"])
-    )
-    for name in ("greedy", "sampled"):
-        stats = getattr(evaluation, name)
-        stats.episodes, stats.wins = int(row[f"{name}_episodes"]), int(row[f"{name}_wins"])
-        stats.return_mean = float(row[f"{name}_return_mean"])
-        stats.length_mean = float(row[f"{name}_length_mean"])
-        plain = {"return", "length"}
-        for key, value in row.items():
-            figure = key.removeprefix(f"{name}_").removesuffix("_mean")
-            if key == f"{name}_{figure}_mean" and figure not in plain:
-                stats.info_means[figure] = float(value)
-    return evaluation

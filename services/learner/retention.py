@@ -2,30 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from liir_common.checkpoint import Manifest
-from liir_common.client import merit
+from liir_common.client import Merit
 from liir_common.config import Config
-from liir_common.rpc.gen.liir.v1 import checkpoint_pb2
 
 
 def superseded(
-    manifests: Sequence[Manifest], evaluations: Mapping[int, checkpoint_pb2.Evaluation], config: Config
+    manifests: Sequence[Manifest], merits_of: Callable[[Sequence[int]], Mapping[int, Merit]], config: Config
 ) -> list[int]:
     """Episodes of the checkpoints that no rule of `config.checkpoints` keeps.
 
-    `manifests` are those there, oldest first. One without its evaluation stays, unless the run has none.
+    `manifests` are those there, oldest first; `merits_of` leaves out the untested. Those stay, unless the run
+    tests nothing.
     """
     rules = config.checkpoints
     if not rules.keep_newest:
         return []
     episodes = [manifest.episode for manifest in manifests]
-    tested = [episode for episode in episodes if episode in evaluations]
+    merits = merits_of(episodes)
     kept = set(episodes[-rules.keep_newest :])
     if rules.keep_every:
         step = rules.keep_every * config.training.checkpoint_interval
         kept |= {episode for episode in episodes if episode % step == 0}
-    kept |= set(sorted(tested, key=lambda episode: merit(evaluations[episode]))[::-1][: rules.keep_best])
-    may_go = tested if config.evaluation.enabled else episodes
+    kept |= set(sorted(merits, key=merits.__getitem__)[::-1][: rules.keep_best])
+    may_go = merits if config.evaluation.enabled else episodes
     return [episode for episode in may_go if episode not in kept]

@@ -31,6 +31,7 @@ from liir_common.config import Config
 from liir_common.errors import ConfigError, CorruptError
 from liir_common.files import Table, check_digest, remove_leftovers, write_atomic, write_digested
 from liir_common.types import Array, EnvSpec
+from services.learner.evaluations import Evaluations
 from services.learner.replay_store import ReplayStore
 
 log = structlog.get_logger()
@@ -81,7 +82,7 @@ class RunDirectory:
         self.checkpoints.remove_leftovers()
         self.replay = ReplayStore(path / "state")
         self.metrics = Table(path / "metrics.csv")
-        self.evaluations = Table(path / "evaluations.csv")
+        self.evaluations = Evaluations(Table(path / "evaluations.csv"), self.created)
 
     def write_parameters(self, counts: Mapping[str, int]) -> None:
         """Record how many parameters each network has."""

@@ -11,6 +11,7 @@ import pytest
 from liir_common import checkpoint
 from liir_common.checkpoint import CheckpointStore, Manifest
 from liir_common.errors import CorruptError
+from tests.traced import bytes_left
 
 TENSORS = {"policy.fc1.bias": np.arange(4, dtype=np.float32), "intrinsic.w": np.ones((2, 3), np.float32)}
 DATA = checkpoint.pack(TENSORS)
@@ -140,6 +141,59 @@ def test_a_deleted_checkpoint_is_gone_and_its_number_taken(tmp_path: Path, kind:
         with pytest.raises(CorruptError, match="checkpoint 200 exists with SHA-256"):
             again.publish(make_manifest(200, other), other)
         assert [manifest.episode for manifest in again.manifests] == [100, 300]
+
+
+def test_the_list_that_somebody_has_does_not_change(store: CheckpointStore) -> None:
+    before = store.manifests
+    for episode in (200, 100):
+        store.publish(make_manifest(episode), DATA)
+    assert before == []
+    assert [manifest.episode for manifest in store.manifests] == [100, 200]
+
+
+def test_deleted_checkpoints_are_known_in_whatever_order_they_went(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = CheckpointStore(str(tmp_path))
+    # Names of ten and eleven digits begin alike.
+    episodes = [300, 100, 1_000_000_000, 10_000_000_000, 200]
+    data = {episode: checkpoint.pack({"x": np.full(1, episode, np.float32)}) for episode in episodes}
+    for episode in episodes:
+        store.publish(make_manifest(episode, data[episode]), data[episode])
+    for episode in episodes:
+        store.delete(episode)
+    for again in (store, CheckpointStore(str(tmp_path))):
+        assert again.frozen == 5
+        for episode in episodes:
+            with pytest.raises(KeyError, match=f"checkpoint {episode} was deleted"):
+                again.find(episode)
+            known = make_manifest(episode, data[episode])
+            with pytest.raises(
+                CorruptError, match=f"checkpoint {episode} exists with SHA-256 {known.sha256}"
+            ):
+                again.publish(make_manifest(episode), DATA)
+            with monkeypatch.context() as patch:
+                # A look at all names takes seconds where there are millions.
+                patch.setattr(again._fs, "glob", None)
+                assert not again.publish(known, data[episode])
+        for episode in (1, 150, 400, 10_000_000_001):
+            with pytest.raises(KeyError, match=f"no checkpoint of episode {episode}"):
+                again.find(episode)
+    assert store.publish(make_manifest(400), DATA)
+
+
+def test_of_a_deleted_checkpoint_a_number_is_in_memory(
+    store: CheckpointStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(checkpoint, "write_atomic", Path.write_bytes)  # which need not be on disk
+
+    def come_and_go(episodes: range) -> None:
+        for episode in episodes:
+            store.publish(make_manifest(episode), DATA)
+            store.delete(episode)
+
+    come_and_go(range(200))
+    assert bytes_left(lambda: come_and_go(range(200, 1200))) / 1000 < 24
 
 
 def test_whoever_dies_while_deleting_leaves_a_checkpoint_deleted(tmp_path: Path) -> None:

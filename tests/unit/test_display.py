@@ -3,11 +3,12 @@
 import io
 import json
 
+import pytest
 import structlog
 from rich.console import Console
 
 from liir_common import logs
-from liir_common.display import LivePanel, LogLines, make_display
+from liir_common.display import LivePanel, LogLines, WinRates, make_display, rows
 from liir_common.rpc.gen.liir.v1 import checkpoint_pb2, training_pb2
 
 STATUS = training_pb2.GetStatusResponse(
@@ -23,14 +24,15 @@ STATUS = training_pb2.GetStatusResponse(
     env_steps_per_second=10_000.0,
     metrics={"policy_lag": 0.0, "return_mean": 12.5, "length_mean": 24.0, "reward_ratio": 0.016},
 )
-EVALUATIONS = [
-    checkpoint_pb2.Evaluation(
-        episode=100 * (i + 1),
-        greedy=checkpoint_pb2.EpisodeStats(episodes=20, wins=wins),
-        sampled=checkpoint_pb2.EpisodeStats(episodes=20, wins=5),
-    )
-    for i, wins in enumerate((2, 19))
-]
+
+
+def win_rates(*wins: int) -> WinRates:
+    """So many greedy wins of 20, one checkpoint after the other."""
+    shown = WinRates()
+    for i, won in enumerate(wins):
+        greedy, sampled = (checkpoint_pb2.EpisodeStats(episodes=20, wins=n) for n in (won, 5))
+        shown.add(checkpoint_pb2.Evaluation(episode=100 * (i + 1), greedy=greedy, sampled=sampled))
+    return shown
 
 
 def test_terminal_shows_all_of_it() -> None:
@@ -38,8 +40,8 @@ def test_terminal_shows_all_of_it() -> None:
     console = Console(file=output, force_terminal=True, width=100, color_system=None)
     display = make_display("title", console)
     assert isinstance(display, LivePanel)
-    display.show(training_pb2.GetStatusResponse(), [])
-    display.show(STATUS, EVALUATIONS)
+    display.show(training_pb2.GetStatusResponse(), WinRates())
+    display.show(STATUS, win_rates(2, 19))
     display.close()
     shown = output.getvalue()
     for text in (
@@ -57,12 +59,31 @@ def test_terminal_shows_all_of_it() -> None:
         assert text in shown
 
 
+@pytest.mark.parametrize(
+    ("wins", "text"),
+    [
+        ((), "no checkpoint tested yet"),
+        ((0,), "0% (best 0%; sampled 25%)"),
+        ((18, 1, 2, 3, 4), "90% 5% 10% 15% 20% (best 90%; sampled 25%)"),
+        ((18, 1, 2, 3, 4, 5, 6), "10% 15% 20% 25% 30% (best 90%; sampled 25%)"),
+    ],
+)
+def test_the_newest_five_and_the_best_of_all_are_shown(wins: tuple[int, ...], text: str) -> None:
+    assert rows(STATUS, win_rates(*wins))["win rate"] == text
+
+
+def test_what_is_shown_does_not_grow() -> None:
+    shown = win_rates(20, *[1] * 1000)
+    assert [evaluation.episode for evaluation in shown.newest] == [99_700, 99_800, 99_900, 100_000, 100_100]
+    assert shown.best == 1.0
+
+
 def test_elsewhere_a_json_line_now_and_then() -> None:
     display = make_display("title", Console(file=io.StringIO()))
     assert isinstance(display, LogLines)
     with structlog.testing.capture_logs() as lines:
-        display.show(STATUS, EVALUATIONS)
-        display.show(STATUS, EVALUATIONS)
+        display.show(STATUS, win_rates(2, 19))
+        display.show(STATUS, win_rates(2, 19))
     assert len(lines) == 1
     line = json.loads(json.dumps(lines[0]))
     assert line["env_steps"] == 250_000

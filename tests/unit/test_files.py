@@ -48,6 +48,26 @@ def test_a_half_written_row_is_dropped(tmp_path: Path) -> None:
     assert path.read_text().splitlines() == ["step,x", "1,0.5", "2,1.5"]
 
 
+def test_a_half_written_header_is_no_header(tmp_path: Path) -> None:
+    path = tmp_path / "table.csv"
+    path.write_text("step,x")
+    Table(path).append({"step": 1, "x": 0.5})
+    assert path.read_text().splitlines() == ["step,x", "1,0.5"]
+
+
+def test_rows_are_found_again_where_they_begin(tmp_path: Path) -> None:
+    path = tmp_path / "table.csv"
+    table = Table(path)
+    assert list(table.scan()) == []
+    starts = [table.append({"step": step, "x": "é," * step}) for step in range(4)]
+    path.write_bytes(path.read_bytes() + b"\n")  # by an editor
+    again = Table(path)
+    starts.append(again.append({"step": 4, "x": ""}))
+    assert [start for start, _ in again.scan()] == starts
+    assert [row for _, row in again.scan()] == again.read()
+    assert [row["step"] for row in again.read_at([starts[3], starts[0]])] == ["3", "0"]
+
+
 def test_rows_may_bring_and_lack_columns(tmp_path: Path) -> None:
     path = tmp_path / "table.csv"
     table = Table(path)

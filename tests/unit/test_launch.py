@@ -11,6 +11,7 @@ import pytest
 
 from liir_common import launch
 from liir_common.config import PLAINTEXT
+from liir_common.display import WinRates
 from liir_common.errors import (
     ConfigError,
     CorruptError,
@@ -21,6 +22,7 @@ from liir_common.errors import (
     UnreachableError,
 )
 from liir_common.launch import Launcher, LocalService, Service
+from liir_common.rpc.gen.liir.v1 import checkpoint_pb2
 from tests.e2e.service import wait_for
 
 PROGRAM = """
@@ -204,3 +206,19 @@ def test_the_newest_run_is_one_that_made_a_step(tmp_path: Path, monkeypatch: pyt
     (tmp_path / "runs/trained/metrics.csv").unlink()
     with pytest.raises(ConfigError, match="no run under runs/ with a step to go on from"):
         launch._newest_run()
+
+
+def test_only_tests_that_are_not_shown_yet_are_asked_for(tmp_path: Path) -> None:
+    learner, actors, evaluator = (Mortal(name, [], tmp_path) for name in ("learner", "actor", "evaluator"))
+    launcher = Launcher(tmp_path, learner, actors, evaluator, PLAINTEXT)
+    stats = checkpoint_pb2.EpisodeStats(episodes=20, wins=1)
+    tested = [
+        checkpoint_pb2.Evaluation(episode=episode, greedy=stats, sampled=stats) for episode in range(1, 9)
+    ]
+    checkpoints, display, win_rates = Mock(), Mock(), WinRates()
+    checkpoints.evaluations.side_effect = [tested[:6], [], tested[6:]]
+    for _ in range(3):
+        launcher._show(display, Mock(), checkpoints, win_rates)
+    assert [call.args for call in checkpoints.evaluations.call_args_list] == [(0,), (6,), (6,)]
+    assert [evaluation.episode for evaluation in win_rates.newest] == [4, 5, 6, 7, 8]
+    assert display.show.call_count == 3

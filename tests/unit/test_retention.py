@@ -3,28 +3,29 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Mapping, Sequence
+from functools import partial
 
 import pytest
 
 from liir_common import config
-from liir_common.rpc.gen.liir.v1 import checkpoint_pb2
+from liir_common.client import Merit
 from services.learner.retention import superseded
 from tests.unit.test_checkpoint import make_manifest
 
 EPISODES = range(100, 1100, 100)
 
 
-def evaluation(episode: int, wins: int) -> checkpoint_pb2.Evaluation:
-    stats = checkpoint_pb2.EpisodeStats(episodes=20, wins=wins)
-    return checkpoint_pb2.Evaluation(episode=episode, greedy=stats, sampled=stats)
+def merits(episodes: Sequence[int], wins: Mapping[int, int]) -> dict[int, Merit]:
+    """Of the tested ones of the episodes, which won so many games."""
+    return {episode: (wins[episode], episode) for episode in episodes if episode in wins}
 
 
 def kept(*settings: str, wins: dict[int, int] | None = None) -> list[int]:
     """What stays of ten checkpoints, all tested unless `wins` says which and how well."""
     tests = dict.fromkeys(EPISODES, 0) if wins is None else wins
-    evaluations = {episode: evaluation(episode, won) for episode, won in tests.items()}
     manifests = [make_manifest(episode) for episode in EPISODES]
-    gone = superseded(manifests, evaluations, config.load(None, settings))
+    gone = superseded(manifests, partial(merits, wins=tests), config.load(None, settings))
     return [episode for episode in EPISODES if episode not in gone]
 
 
@@ -61,11 +62,11 @@ def test_the_best_so_far_is_there_after_every_step() -> None:
     """Deleting step by step, as a run does, never loses what the rule keeps at the end."""
     results = random.Random(1)
     resolved = config.load(None, ["checkpoints.keep_newest=2", "checkpoints.keep_best=2"])
-    there, evaluations = [], {}
+    there, wins = [], {}
     for episode in range(100, 5100, 100):
         there.append(make_manifest(episode))
-        evaluations[episode] = evaluation(episode, results.randrange(21))
-        gone = superseded(there, evaluations, resolved)
+        wins[episode] = results.randrange(21)
+        gone = superseded(there, partial(merits, wins=wins), resolved)
         there = [manifest for manifest in there if manifest.episode not in gone]
-        ranked = sorted(evaluations, key=lambda e: (evaluations[e].greedy.wins, e))
-        assert {manifest.episode for manifest in there} == {*ranked[-2:], *list(evaluations)[-2:]}
+        ranked = sorted(wins, key=lambda e: (wins[e], e))
+        assert {manifest.episode for manifest in there} == {*ranked[-2:], *list(wins)[-2:]}

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import signal
+import subprocess
 import sys
 import tempfile
 import time
@@ -36,11 +37,14 @@ PROCESSES = {
     "driver": "services.actor",
     "evaluator": "services.evaluator",
     "actor": "ray::ActorProcess",
+    "gcs_server": "/gcs/gcs_server",
+    "raylet": "/raylet/raylet",
 }
+"""What is in a process's command line, and in no other's."""
 EVERY_S = 2.0
 START_S = 600.0
-MOST_PER_HOUR = {"memory, MiB": 50.0, "descriptors": 20.0, "threads": 20.0, "streams": 20.0}
-"""The learner does grow: with the evaluations, of which there are thousands an hour here."""
+MOST_PER_HOUR = {"memory, MiB": 10.0, "descriptors": 20.0, "threads": 20.0, "streams": 20.0}
+"""The learner may grow by 24 bytes of each checkpoint, which is 0.2 MiB of the thousands an hour here."""
 CERTAIN = 3.0
 """So many standard errors beyond it, a slope is growth and no chance."""
 BLOCKS = 10
@@ -62,6 +66,16 @@ def sample(process: psutil.Process, name: str, now: float, samples: Samples) -> 
         samples[name, "threads"].append((now, process.num_threads()))
 
 
+def processes(training: subprocess.Popen[str]) -> dict[str, psutil.Process]:
+    """All that are sampled, by name."""
+    found = {"launcher": psutil.Process(training.pid)}
+    for name, command in PROCESSES.items():
+        alike = service.descendants(training, command)
+        assert len(alike) == (ACTORS if name == "actor" else 1), f"{name}: {alike}"
+        found |= {f"{name} {number}" if name == "actor" else name: each for number, each in enumerate(alike)}
+    return found
+
+
 def measure(run_dir: Path, minutes: float) -> tuple[Samples, int]:
     """Samples of a training of so many minutes, and its learner steps.
 
@@ -73,11 +87,7 @@ def measure(run_dir: Path, minutes: float) -> tuple[Samples, int]:
         service.wait_for(lambda: service.learner_step(run_dir) > 0, "the first learner step", START_S)
         with service.client(run_dir) as client:
             service.wait_for(lambda: client.status().actors == ACTORS, "the last actor", START_S)
-            found = {
-                f"{name} {number}" if name == "actor" else name: process
-                for name, command in PROCESSES.items()
-                for number, process in enumerate(service.descendants(training, command))
-            }
+            found = processes(training)
             begin = time.monotonic()
             while (now := time.monotonic() - begin) < 60 * minutes:
                 for name, process in found.items():

@@ -23,7 +23,7 @@ def lower_bound(minutes: float, per_hour: float, seed: int) -> float:
     return slope - soak.CERTAIN * error
 
 
-@pytest.mark.parametrize(("minutes", "per_hour"), [(4, 600), (60, 80)])
+@pytest.mark.parametrize(("minutes", "per_hour"), [(4, 400), (60, 25)])
 def test_a_leak_is_told_from_noise(minutes: float, per_hour: float) -> None:
     most = soak.MOST_PER_HOUR["memory, MiB"]
     leaks = [lower_bound(minutes, per_hour, seed) > most for seed in range(50)]

@@ -200,8 +200,8 @@ class CheckpointStore:
         if missing.size:
             raise CorruptError(
                 f"{missing.size} checkpoints, from {missing[0]} on, are missing under {self._root}; restore "
-                f"them from a backup, or make an empty file deleted-{missing[0]:09d}-lost.json there for each "
-                "to go on without them"
+                f"them from a backup, or make an empty file deleted-{missing[0]:09d}-lost.json there for "
+                "each to go on without them"
             )
 
     def read(self, manifest: Manifest) -> bytes:

@@ -7,6 +7,7 @@ import errno
 import fcntl
 import hashlib
 import io
+import mmap
 import os
 import re
 import tempfile
@@ -148,11 +149,18 @@ class Table:
         return _append_whole(self.path, text.getvalue().encode())
 
     def keep(self, column: str, at_most: int) -> None:
-        """Drop the rows whose `column` is larger; a resumed run writes them again."""
-        rows = self.read()
-        kept = [row for row in rows if int(row[column]) <= at_most]
-        if len(kept) < len(rows):
-            self._rewrite(kept, self.columns)
+        """Drop the last rows, those whose `column` is larger; a resumed run writes them again."""
+        if not self.columns:
+            return
+        place = self.columns.index(column)
+        with self.path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+            end = len(data)
+            while start := data.rfind(b"\n", 0, end - 1) + 1:  # 0 for the line of the columns
+                cells = _cells(data[start:end])
+                if cells and int(cells[place]) <= at_most:
+                    break
+                end = start
+        os.truncate(self.path, end)
 
     def _row(self, line: bytes) -> dict[str, str]:
         return dict(zip(self.columns, _cells(line), strict=True))
@@ -194,3 +202,15 @@ def read_table(path: Path) -> list[dict[str, str]]:
         return []
     text = path.read_text(encoding="utf-8")
     return list(csv.DictReader(text[: text.rfind("\n") + 1].splitlines()))
+
+
+def last_row(path: Path) -> dict[str, str] | None:
+    """The last complete row of a CSV file, which may be long, and growing; None if there is none."""
+    if not path.exists() or not path.stat().st_size:
+        return None
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        end = data.rfind(b"\n") + 1
+        start = data.rfind(b"\n", 0, max(0, end - 1)) + 1
+        if not start:
+            return None
+        return dict(zip(_cells(data[: data.find(b"\n") + 1]), _cells(data[start:end]), strict=True))

@@ -13,7 +13,7 @@ import yaml
 
 from liir_common.config import EnvConfig, leaves
 from liir_common.errors import ConfigError
-from liir_common.files import csv_text, read_table, write_atomic
+from liir_common.files import csv_text, last_row, read_table, write_atomic
 
 _LEVEL = 0.9
 _IN_A_ROW = 3
@@ -43,13 +43,12 @@ class Summary:
 
 def summarise(run_dir: Path) -> Summary:
     """Read the figures of the run in `run_dir`."""
-    steps = read_table(run_dir / "metrics.csv")
+    last = last_row(run_dir / "metrics.csv") or {"learner_step": "0", "env_steps": "0", "episodes": "0"}
     tests = sorted(read_table(run_dir / "evaluations.csv"), key=lambda row: int(row["episode"]))
     greedy = [float(row["greedy_win_rate"]) for row in tests]
     sampled = [float(row["sampled_win_rate"]) for row in tests]
     first = _first(greedy, 1)
     lasting = _first(greedy, _IN_A_ROW)
-    last = steps[-1] if steps else {"learner_step": "0", "env_steps": "0", "episodes": "0"}
     return Summary(
         learner_steps=int(last["learner_step"]),
         env_steps=int(last["env_steps"]),

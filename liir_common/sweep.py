@@ -27,7 +27,7 @@ from pydantic import Field, ValidationError
 from liir_common import results
 from liir_common.config import Config, Section, differences, from_tree, holds_run, merge, parse_settings
 from liir_common.errors import ConfigError
-from liir_common.files import csv_text, read_table, write_atomic
+from liir_common.files import csv_text, last_row, read_table, write_atomic
 from liir_common.launch import die_with_parent
 from liir_common.rpc.tokens import VARIABLE
 
@@ -258,7 +258,7 @@ class Sweep:
         run_dir = self._output / run.name
         complete = is_complete(run_dir, run.config)
         begun = "begun" if holds_run(run_dir) else "waiting"
-        steps = read_table(run_dir / "metrics.csv")
+        last = last_row(run_dir / "metrics.csv")
         return {
             "run": run.name,
             "method": run.method,
@@ -266,7 +266,7 @@ class Sweep:
             "seed": run.seed,
             "config_digest": results.config_digest(run.config.tree()),
             "status": "complete" if complete else ended or begun,
-            "env_steps": int(steps[-1]["env_steps"]) if steps else 0,
+            "env_steps": int(last["env_steps"]) if last else 0,
             "total_env_steps": run.config.training.total_env_steps,
         }
 
@@ -290,10 +290,10 @@ class Sweep:
 
 def is_complete(run_dir: Path, config: Config) -> bool:
     """Whether the run has all its environment steps and, if it tests its checkpoints, all their tests."""
-    steps = read_table(run_dir / "metrics.csv")
-    if not steps or int(steps[-1]["env_steps"]) < config.training.total_env_steps:
+    last = last_row(run_dir / "metrics.csv")
+    if not last or int(last["env_steps"]) < config.training.total_env_steps:
         return False
-    frozen = int(steps[-1]["episodes"]) // config.training.checkpoint_interval
+    frozen = int(last["episodes"]) // config.training.checkpoint_interval
     return not config.evaluation.enabled or len(read_table(run_dir / "evaluations.csv")) == frozen
 
 

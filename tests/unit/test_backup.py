@@ -12,6 +12,7 @@ import pytest
 from liir_common.backup import back_up
 from liir_common.errors import ConfigError
 from liir_common.files import read_table
+from liir_common.rpc.gen.liir.v1 import checkpoint_pb2
 from tests.unit.test_trainer import REPLAY, Played, left_behind
 
 STEPS = 40
@@ -43,7 +44,9 @@ class Live:
         self.played.trainer._step()
         store = self.played.run.checkpoints
         for manifest in store.manifests[:-CHECKPOINTS_LEFT]:
-            self.played.run.evaluations.append({"episode": manifest.episode, "sha256": manifest.sha256})
+            stats = checkpoint_pb2.EpisodeStats(episodes=1)
+            tested = checkpoint_pb2.Evaluation(episode=manifest.episode, greedy=stats, sampled=stats)
+            self.played.run.evaluations.add(tested, manifest)
             store.delete(manifest.episode)
 
 
@@ -65,7 +68,7 @@ def test_a_copy_of_a_run_that_goes_on_is_resumed_as_if_nothing_had_been(
     assert copy.trainer.next_batch == begin
     deleted = set(copy.run.checkpoints._deleted)
     assert deleted
-    assert deleted <= {int(row["episode"]) for row in copy.run.evaluations.read()}
+    assert not [episode for episode in deleted if episode not in copy.run.evaluations]
     copy.train()
     rows, wanted = (left_behind(played.run.path)[1] for played in (copy, whole))
     assert rows == wanted

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from liir_common.files import Table, remove_leftovers, write_atomic
+from liir_common.files import Table, last_row, remove_leftovers, write_atomic
 
 
 def test_a_failed_write_leaves_the_old_content_and_nothing_else(
@@ -80,11 +80,38 @@ def test_rows_may_bring_and_lack_columns(tmp_path: Path) -> None:
 def test_keep_drops_what_a_resumed_run_writes_again(tmp_path: Path) -> None:
     path = tmp_path / "table.csv"
     table = Table(path)
+    table.keep("step", 0)
     for step in range(1, 6):
-        table.append({"step": step})
+        table.append({"x": "é", "step": step})
+    path.write_bytes(path.read_bytes() + b"\n")  # by an editor
+    table.keep("step", 5)
+    assert [row["step"] for row in table.read()] == ["1", "2", "3", "4", "5"]
     table.keep("step", 3)
-    table.append({"step": 4})
-    assert path.read_text().splitlines() == ["step", "1", "2", "3", "4"]
+    table.append({"x": "", "step": 4})
+    assert path.read_text().splitlines() == ["x,step", "é,1", "é,2", "é,3", ",4"]
+    table.keep("step", 0)
+    assert path.read_text().splitlines() == ["x,step"]
+
+
+@pytest.mark.parametrize(
+    ("text", "row"),
+    [
+        (None, None),
+        ("", None),
+        ("ste", None),
+        ("step,x\n", None),
+        ("step,x\n1,", None),
+        ("step,x\n1,é\n", {"step": "1", "x": "é"}),
+        ("step,x\n1,é\n2,b\n3", {"step": "2", "x": "b"}),
+    ],
+)
+def test_the_last_row_is_the_last_that_is_complete(
+    tmp_path: Path, text: str | None, row: dict[str, str] | None
+) -> None:
+    path = tmp_path / "table.csv"
+    if text is not None:
+        path.write_text(text)
+    assert last_row(path) == row
 
 
 @contextmanager

@@ -6,6 +6,7 @@ import faulthandler
 import os
 import time
 from collections import Counter
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
@@ -40,6 +41,9 @@ class _Member:
     name: str
     incarnation: int = -1
     started: float = 0.0
+    phase: str = ""
+    """What it was doing last, for all that is known: starting or playing."""
+    phase_since: float = 0.0
     start_at: float = 0.0
     """When it is due to start, on the monotonic clock."""
     actor: Any = None
@@ -91,8 +95,10 @@ class Fleet:
         """
         while self._members and not self._stopping:
             starting = self._start_due()
+            # Asked each time: by this Ray notices that the head is not the one joined, and ends the process.
+            crowds = self._crowds()
             if not starting and len(self._members) == self._count:  # nobody has been told to leave
-                self._even_out()
+                self._even_out(crowds)
             metrics.ACTORS_ALIVE.set(sum(member.run is not None for member in self._members))
             self._collect_ended(_POLL_WHILE_STARTING_S if starting else _POLL_S)
 
@@ -103,6 +109,7 @@ class Fleet:
             if ray.wait([member.ready], timeout=0)[0]:
                 with suppress(ray.exceptions.RayActorError):  # which `run` has, too
                     member.node = ray.get(member.ready)
+                    member.phase, member.phase_since = "playing", time.monotonic()
                 member.ready = None
         now = time.monotonic()
         due = [member for member in self._members if member.run is None and member.start_at <= now]
@@ -113,7 +120,8 @@ class Fleet:
 
     def _start(self, member: _Member) -> None:
         member.incarnation += 1
-        member.started = time.monotonic()
+        member.started = member.phase_since = time.monotonic()
+        member.phase = "starting"
         crowds = self._crowds()
         member.node = min(crowds, key=lambda node: crowds[node], default="")
         # Ray takes another node if that one is just being lost, and waits if there is none at all.
@@ -123,9 +131,8 @@ class Fleet:
         )
         member.ready, member.run = member.actor.ready.remote(), member.actor.run.remote()
 
-    def _even_out(self) -> None:
+    def _even_out(self, crowds: Mapping[str, int]) -> None:
         """Move one actor from the fullest node to the emptiest, which may be new or back."""
-        crowds = self._crowds()
         if not crowds or max(crowds.values()) - min(crowds.values()) < 2:
             return
         fullest = max(crowds, key=lambda node: crowds[node])
@@ -167,7 +174,12 @@ class Fleet:
             self._waits[member.name] = backoffs()
         wait = next(self._waits[member.name])
         log.error(
-            "an actor died; it is started again", actor=member.name, wait_s=round(wait, 2), error=str(error)
+            "an actor died; it is started again",
+            actor=member.name,
+            phase=member.phase,
+            phase_s=round(now - member.phase_since, 1),
+            wait_s=round(wait, 2),
+            error=str(error),
         )
         metrics.ACTOR_RESTARTS.inc()
         # The node may be lost as well: it looks empty then, and Ray would let actors wait for it.

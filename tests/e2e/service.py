@@ -119,7 +119,7 @@ def samples(url: str) -> dict[str, float]:
     return {name: float(value) for name, _, value in lines}
 
 
-def descendants(process: subprocess.Popen[str], command: str) -> list[psutil.Process]:
+def descendants(process: subprocess.Popen[str] | psutil.Process, command: str) -> list[psutil.Process]:
     """Processes under `process` whose command line contains `command`."""
     found = []
     for child in psutil.Process(process.pid).children(recursive=True):

@@ -72,6 +72,12 @@ class Supervised:
             return [root, *root.children(recursive=True)]
         return []
 
+    def kill(self) -> None:
+        """Kill the process and all that it started: the machine is lost."""
+        for process in self.tree():
+            with suppress(psutil.NoSuchProcess):
+                process.kill()
+
 
 class Supervisor:
     """Starts again what fails."""
@@ -122,9 +128,12 @@ def add_ray(supervisor: Supervisor, folder: Path, temporary: Path, nodes: int) -
     )
     # Ray keeps notes of its own nodes there, and its sockets, whose paths must be short.
     places = {"RAY_TMPDIR": str(temporary), "RAY_AUTH_MODE": "disabled"}
-    head = ("ray", "start", "--head", f"--port={address.rpartition(':')[2]}", "--num-cpus=0")
+    # By that note Ray takes nodes of a head that died for a cluster, and would not start another head here.
+    forget = ("/bin/sh", "-c", f'rm -f {temporary}/ray_current_cluster; exec "$0" "$@"')
+    head = (str(_BIN / "ray"), "start", "--head", f"--port={address.rpartition(':')[2]}", "--num-cpus=0")
     supervisor.add(
         "head",
+        *forget,
         *head,
         "--include-dashboard=false",
         f"--temp-dir={temporary}",

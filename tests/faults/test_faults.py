@@ -17,6 +17,7 @@ from pathlib import Path
 
 import psutil
 import pytest
+import yaml
 
 from liir_common.errors import ComputeError, DiskFullError, UnreachableError
 from tests.e2e import service
@@ -26,6 +27,7 @@ from tests.faults.supervisor import Clock, Supervised, Supervisor, add_ray
 
 pytestmark = [pytest.mark.faults, pytest.mark.timeout(1200)]
 
+COMPOSE = Path(__file__).parents[2] / "docker-compose.yml"
 SEED = 20191208
 SETTINGS = (
     "actors.count=4",
@@ -50,6 +52,7 @@ PLAN = {
     "pause_learner": 3,
     "kill_driver": 2,
     "kill_node": 2,
+    "kill_head": 2,
     "fill_disk": 4,
     "skew_learner": 6,
     "skew_evaluator": 4,
@@ -169,10 +172,11 @@ class Faults:
 
     def kill_node(self) -> None:
         """A whole machine of the cluster, with its actors: the raylet goes and takes them along."""
-        node = self.supervisor.services[self._random.choice(("node-0", "node-1"))]
-        for process in node.tree():
-            with suppress(psutil.NoSuchProcess):
-                process.kill()
+        self.supervisor.services[self._random.choice(("node-0", "node-1"))].kill()
+
+    def kill_head(self) -> None:
+        """The machine that knows the cluster: nodes and driver have to notice, and to join the new one."""
+        self.supervisor.services["head"].kill()
 
     def fill_disk(self) -> None:
         """To the last byte, until the learner says so: it waits, or cannot start."""
@@ -246,7 +250,11 @@ def inject(faults: Faults, learner_steps: int) -> None:
     faults.due = learner_steps
 
 
-def test_a_hundred_faults_change_nothing(tmp_path: Path, small_disk: Path) -> None:
+def test_a_hundred_faults_change_nothing(
+    tmp_path: Path, small_disk: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in yaml.safe_load(COMPOSE.read_text())["x-ray"]["environment"].items():
+        monkeypatch.setenv(name, str(value))  # Ray's nodes and the driver go by it
     undisturbed = tmp_path / "undisturbed"
     command = service.start("train", "--run-dir", str(undisturbed), *service.arguments(SETTINGS))
     service.finish(command, timeout_s=600)

@@ -39,10 +39,13 @@ class ActorStream:
         """The version sent last."""
         self.peak_memory = 0
         """Bytes, as the actor says."""
+        self.heard = time.monotonic()
+        """When the actor sent something last."""
+        self.error: Exception | None = None
+        """What the stream ends with, unless in peace."""
         self._waiting: deque[rollout_pb2.PlayResponse] = deque()
         self._woken = asyncio.Event()
         self._ended = False
-        self._error: Exception | None = None
 
     def policy(self, policy: rollout_pb2.Policy) -> None:
         """Send a policy, in front of the tickets that name it."""
@@ -66,7 +69,7 @@ class ActorStream:
 
     def end(self, error: Exception | None = None) -> None:
         """Close the stream once all is sent, with an error if one is given."""
-        self._ended, self._error = True, self._error or error
+        self._ended, self.error = True, self.error or error
         self._woken.set()
 
     async def responses(self) -> AsyncIterator[rollout_pb2.PlayResponse]:
@@ -82,8 +85,8 @@ class ActorStream:
                 break
             self._woken.clear()
             await self._woken.wait()
-        if self._error:
-            raise self._error
+        if self.error:
+            raise self.error
 
     def _last(self) -> rollout_pb2.PlayResponse:
         return self._waiting[-1] if self._waiting else self._new()
@@ -201,7 +204,16 @@ class RolloutService(rollout_pb2_grpc.RolloutServiceServicer):
             self._empty.set()
         metrics.ACTORS.set(self.actors)
         reissued = self._intake.leave(stream)
-        log.info("actor left", actor=stream.actor_id, tickets_to_others=reissued, actors=self.actors)
+        # To gRPC here, an actor that goes and one that is lost are the same: the end of what it sends.
+        reason = str(stream.error) if stream.error else "sent home" if self._drain else "gone or lost"
+        log.info(
+            "actor left",
+            actor=stream.actor_id,
+            reason=reason,
+            silent_s=round(time.monotonic() - stream.heard, 1),
+            tickets_to_others=reissued,
+            actors=self.actors,
+        )
         self._reissued(reissued, "left")
 
     async def _read(
@@ -223,6 +235,7 @@ class RolloutService(rollout_pb2_grpc.RolloutServiceServicer):
             stream.end()
 
     def _handle(self, request: rollout_pb2.PlayRequest, stream: ActorStream) -> None:
+        stream.heard = time.monotonic()
         if request.HasField("ready"):
             tickets = request.ready.tickets
             if not 1 <= tickets <= _MAX_READY:

@@ -110,11 +110,17 @@ def test_signals_are_for_the_learner_and_what_kills_it_is_told() -> None:
         for signum in (signal.SIGINT, signal.SIGTERM):  # as a terminal sends them, to all
             os.kill(compute.pid, signum)
         assert compute.parameter_counts()
-        os.kill(compute.pid, signal.SIGKILL)
-        with pytest.raises(ComputeError, match="learner steps is gone: SIGKILL killed it; resume the run"):
-            compute.update(batch_of(0))
-        with pytest.raises(ComputeError, match="is gone"):
+        with pytest.raises(ComputeError, match="gone: SIGKILL killed it during 'load_state'; resume the run"):
+            compute.load_state({"": Fatal()})  # type: ignore[dict-item]
+        with pytest.raises(ComputeError, match="SIGKILL killed it before 'policy'"):
             compute.policy()
+
+
+class Fatal:
+    """Kills the process that receives it."""
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return signal.raise_signal, (signal.SIGKILL,)
 
 
 def test_it_ends_with_whoever_started_it() -> None:

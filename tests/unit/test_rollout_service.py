@@ -6,8 +6,11 @@ import queue
 
 import numpy as np
 import pytest
+import structlog
 
 from liir_common import config
+from liir_common.build import build
+from liir_common.rpc.gen.liir.v1 import rollout_pb2
 from services.learner.intake import Opening
 from services.learner.rollout_service import RolloutService
 from tests.samples import SPEC
@@ -21,3 +24,29 @@ def test_policies_that_no_open_batch_is_played_by_are_forgotten(lag: int) -> Non
         version = max(0, batch - lag)
         service.publish(Opening(batch, version, 0.0), {"fc1.bias": np.zeros(2, np.float32)})
         assert sorted(service._policies) == list(range(max(0, version - lag), version + 1))
+
+
+@pytest.mark.parametrize(
+    ("error", "drain", "reason"),
+    [
+        (None, None, "gone or lost"),
+        (None, rollout_pb2.Drain(), "sent home"),
+        (ValueError("obs: damaged"), rollout_pb2.Drain(), "obs: damaged"),
+    ],
+)
+def test_the_log_says_what_is_known_of_an_actor_that_left(
+    error: Exception | None, drain: rollout_pb2.Drain | None, reason: str
+) -> None:
+    service = RolloutService(config.load(), SPEC, 0, queue.SimpleQueue())
+    service.publish(Opening(0, 0, 0.0), {"fc1.bias": np.zeros(2, np.float32)})
+    stream = service._greet(rollout_pb2.Hello(actor_id="a", env_spec_hash=SPEC.hash, build=build()))
+    service._handle(rollout_pb2.PlayRequest(ready=rollout_pb2.Ready(tickets=3)), stream)
+    stream.heard -= 12
+    stream.end(error)
+    service._drain = drain
+    with structlog.testing.capture_logs() as lines:
+        service._leave(stream)
+    (line,) = lines
+    wanted = {"actor": "a", "reason": reason, "tickets_to_others": 3, "actors": 0}
+    assert line.items() >= wanted.items()
+    assert 12 <= line["silent_s"] < 24

@@ -110,12 +110,12 @@ class Compute:
         try:
             self._connection.send((what, arguments))
         except OSError:
-            raise self._death() from None
+            raise self._death(f"before {what!r}") from None
         while True:
             try:
                 answer, value = self._connection.recv()
             except (EOFError, OSError):
-                raise self._death() from None
+                raise self._death(f"during {what!r}") from None
             if answer is Answer.VALUE:
                 return value
             if answer is Answer.ERROR:
@@ -130,12 +130,12 @@ class Compute:
             self._process.kill()
             return self._process.wait()
 
-    def _death(self) -> ComputeError:
+    def _death(self, when: str) -> ComputeError:
         code = self._end()
         how = f"{signal.Signals(-code).name} killed it" if code < 0 else f"it ended with code {code}"
         return ComputeError(
-            f"the process that computes learner steps is gone: {how}; resume the run, which goes on from its "
-            "last saved state; if nobody killed it, see that the machine has memory enough"
+            f"the process that computes learner steps is gone: {how} {when}; resume the run, which goes on "
+            "from its last saved state; if nobody killed it, see that the machine has memory enough"
         )
 
 

@@ -59,6 +59,8 @@ test-ray-submit: setup ## Run ray up, submit and down on three isolated machines
 test-faults: setup ## Run the fault tests: a hundred faults in one training, and more
 	$(if $(filter 0,$(shell id -u)),,unshare --map-root-user --mount) $(BIN)/pytest -m faults $(ARGS)
 
+test-all: test test-monitoring test-faults fuzz test-ray-submit test-compose ## All of them, before a release
+
 MINUTES ?= 5
 soak: setup ## Train for MINUTES and say whether memory, descriptors, threads or streams grow
 	$(BIN)/python -m tests.faults.soak --minutes $(MINUTES)
@@ -95,5 +97,5 @@ proto-check: proto
 	git diff --exit-code -- $(GEN)
 	test -z "$$(git ls-files --others -- $(GEN) | grep -v __pycache__)"
 
-.PHONY: help setup train test browser fuzz test-monitoring test-compose test-ray-submit test-faults soak dashboard \
+.PHONY: help setup train test test-all browser fuzz test-monitoring test-compose test-ray-submit test-faults soak dashboard \
 	requirements lint proto proto-check

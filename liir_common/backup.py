@@ -8,6 +8,7 @@ may know more, never less, than what counts on it.
 from __future__ import annotations
 
 import io
+import os
 import tarfile
 import time
 from collections.abc import Iterator
@@ -17,8 +18,10 @@ from typing import BinaryIO
 
 from liir_common.config import holds_run
 from liir_common.errors import ConfigError
+from liir_common.files import complete_bytes
 
-Member = tuple[Path, BinaryIO]
+Member = tuple[Path, BinaryIO, int]
+"""Where it was, and of the open file so many bytes."""
 
 
 def back_up(run_dir: Path, archive: BinaryIO) -> None:
@@ -27,27 +30,25 @@ def back_up(run_dir: Path, archive: BinaryIO) -> None:
     Raises:
         ConfigError: there is no run at `run_dir`.
     """
-    run_dir = run_dir.absolute()
+    run_dir = run_dir.resolve()
     if not holds_run(run_dir):
         raise ConfigError(f"there is no run at {run_dir}; name the folder that has its run.json")
     with ExitStack() as stack, tarfile.open(fileobj=archive, mode="w|gz") as tar:
-        for path, file in _members(run_dir, stack):
+        for path, file, size in _members(run_dir, stack):
             member = tarfile.TarInfo(str(path.relative_to(run_dir.parent)))
-            member.size, member.mtime = file.seek(0, io.SEEK_END), int(time.time())
-            file.seek(0)
+            member.size, member.mtime = size, int(time.time())
             tar.addfile(member, file)
 
 
 def _members(run_dir: Path, stack: ExitStack) -> Iterator[Member]:
     yield from _state(run_dir / "state", stack)
     for name in ("run.json", "config.yaml"):
-        yield run_dir / name, io.BytesIO((run_dir / name).read_bytes())
+        yield _whole(run_dir / name)
     yield from _checkpoints(run_dir / "checkpoints")
     for path in (run_dir / "metrics.csv", run_dir / "evaluations.csv"):
         if path.exists():
-            rows = path.read_bytes()
             # Without a row that is just being written.
-            yield path, io.BytesIO(rows[: rows.rfind(b"\n") + 1])
+            yield path, stack.enter_context(path.open("rb")), complete_bytes(path)
 
 
 def _state(folder: Path, stack: ExitStack) -> list[Member]:
@@ -57,7 +58,10 @@ def _state(folder: Path, stack: ExitStack) -> list[Member]:
         with suppress(FileNotFoundError):
             files = [stack.enter_context(path.open("rb")) for path in paths]
             if sorted(folder.glob("*.safetensors")) == paths:  # nothing was saved or removed in between
-                return list(zip(paths, files, strict=True))
+                return [
+                    (path, file, os.fstat(file.fileno()).st_size)
+                    for path, file in zip(paths, files, strict=True)
+                ]
 
 
 def _checkpoints(folder: Path) -> Iterator[Member]:
@@ -69,5 +73,10 @@ def _checkpoints(folder: Path) -> Iterator[Member]:
             # In this order: weights are removed only after their manifest got its other name.
             for path in (manifest.with_suffix(".safetensors"), manifest):
                 with suppress(FileNotFoundError):
-                    yield path, io.BytesIO(path.read_bytes())
+                    yield _whole(path)
         seen |= manifests
+
+
+def _whole(path: Path) -> Member:
+    data = path.read_bytes()
+    return path, io.BytesIO(data), len(data)

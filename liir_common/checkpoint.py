@@ -32,6 +32,8 @@ from liir_common.types import EnvSpec
 
 Tensors = Mapping[str, NDArray[np.float32]]
 
+_LOST = "lost"
+"""In place of the digest of a checkpoint that somebody does without, whatever it was."""
 _EPISODE = attrgetter("episode")
 
 
@@ -122,6 +124,7 @@ class CheckpointStore:
         # Of the many that a long run deletes, a number each is in memory; their names have the digests.
         self._deleted = array("q", sorted(deleted))
         self._left_over = _episodes(names, r"checkpoint-(\d+)\.safetensors") & deleted
+        self._lost = len(_episodes(names, rf"deleted-(\d+)-{_LOST}\.json"))
 
     @property
     def manifests(self) -> list[Manifest]:
@@ -130,9 +133,9 @@ class CheckpointStore:
 
     @property
     def frozen(self) -> int:
-        """How many checkpoints were ever frozen, the deleted ones included."""
+        """How many checkpoints were ever frozen: the deleted ones, too, but not those given up as lost."""
         with self._lock:
-            return len(self._manifests) + len(self._deleted)
+            return len(self._manifests) + len(self._deleted) - self._lost
 
     def publish(self, manifest: Manifest, data: bytes) -> bool:
         """Write a checkpoint; false if a resumed run came to the same one again, deleted since or not.
@@ -200,7 +203,7 @@ class CheckpointStore:
         if missing.size:
             raise CorruptError(
                 f"{missing.size} checkpoints, from {missing[0]} on, are missing under {self._root}; restore "
-                f"them from a backup, or make an empty file deleted-{missing[0]:09d}-lost.json there for "
+                f"them from a backup, or make an empty file deleted-{missing[0]:09d}-{_LOST}.json there for "
                 "each to go on without them"
             )
 
@@ -236,6 +239,8 @@ class CheckpointStore:
             return manifest.sha256
         for path in self._fs.glob(f"{self._root}/deleted-{manifest.episode:09d}[-.]*json"):
             named = re.search(r"deleted-\d+-(\w+)\.json$", path)
+            if named and named[1] == _LOST:
+                return manifest.sha256
             return named[1] if named else self._read_manifest(path).sha256
         return ""  # somebody has removed it
 
@@ -243,7 +248,7 @@ class CheckpointStore:
         try:
             return Manifest.from_json(self._fs.cat_file(path).decode())
         except (CorruptError, UnicodeDecodeError) as error:
-            name = re.sub(r".*-(\d+)\.json", r"deleted-\1-lost.json", path)
+            name = re.sub(r".*-(\d+)\.json", rf"deleted-\1-{_LOST}.json", path)
             raise CorruptError(
                 f"{path}: {error}; restore it from a backup, or rename it to {name} to go on without it"
             ) from None

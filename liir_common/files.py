@@ -109,10 +109,9 @@ class Table:
         self.path = path
         self.columns: list[str] = []
         if path.exists():
-            with path.open("r+b") as file:
-                # Without the row that a dying process may have left half-written.
-                file.truncate(sum(len(line) for line in file if line.endswith(b"\n")))
-                file.seek(0)
+            # Without the row that a dying process may have left half-written.
+            os.truncate(path, complete_bytes(path))
+            with path.open("rb") as file:
                 self.columns = _cells(file.readline())
 
     def read(self) -> list[dict[str, str]]:
@@ -206,11 +205,21 @@ def read_table(path: Path) -> list[dict[str, str]]:
 
 def last_row(path: Path) -> dict[str, str] | None:
     """The last complete row of a CSV file, which may be long, and growing; None if there is none."""
-    if not path.exists() or not path.stat().st_size:
+    end = complete_bytes(path) if path.exists() else 0
+    if not end:
         return None
+    with path.open("rb") as file, mmap.mmap(file.fileno(), end, access=mmap.ACCESS_READ) as data:
+        columns = _cells(file.readline())
+        while start := data.rfind(b"\n", 0, end - 1) + 1:  # 0 for the line of the columns
+            if cells := _cells(data[start:end]):
+                return dict(zip(columns, cells, strict=True))
+            end = start
+    return None
+
+
+def complete_bytes(path: Path) -> int:
+    """How many bytes of a file, which may be growing, are complete lines."""
+    if not path.stat().st_size:
+        return 0
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-        end = data.rfind(b"\n") + 1
-        start = data.rfind(b"\n", 0, max(0, end - 1)) + 1
-        if not start:
-            return None
-        return dict(zip(_cells(data[: data.find(b"\n") + 1]), _cells(data[start:end]), strict=True))
+        return data.rfind(b"\n") + 1

@@ -377,7 +377,8 @@ def train(
     with storage_explained(run_dir):
         summary = write_report(run_dir)
     print_summary(run_dir, summary)
-    if summary.env_steps < config.training.total_env_steps or launcher.stop_signal:
+    complete = summary.env_steps >= config.training.total_env_steps
+    if not complete or (launcher.stop_signal and not config.learner.stay):
         print(f"stopped early; go on with: {command} --resume --run-dir {run_dir}", file=sys.stderr)
     if launcher.stop_signal:
         raise SystemExit(128 + launcher.stop_signal)

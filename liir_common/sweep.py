@@ -32,9 +32,9 @@ from liir_common.launch import die_with_parent
 from liir_common.rpc.tokens import VARIABLE
 
 _POLL_S = 0.5
-# Several runs share a machine, so every server takes a free port.
-_FREE_PORTS = {
-    "learner": {"port": 0, "metrics_port": 0},
+# Several runs share a machine, so every server takes a free port; and one run makes room for the next.
+_TOGETHER = {
+    "learner": {"port": 0, "metrics_port": 0, "stay": False},
     "actors": {"metrics_port": 0},
     "evaluation": {"metrics_port": 0},
 }
@@ -130,7 +130,7 @@ def _chosen(kind: str, names: Sequence[str], known: Mapping[str, Any]) -> Sequen
 
 def _resolve(sweep: SweepConfig, map_name: str, method: str, seed: int, over: Mapping[str, Any]) -> Run:
     named = {"seed": seed, "env": {"map": map_name}, "algorithm": {"name": method}}
-    layers = [sweep.base, named, sweep.maps[map_name], sweep.methods[method], over, _FREE_PORTS]
+    layers = [sweep.base, named, sweep.maps[map_name], sweep.methods[method], over, _TOGETHER]
     try:
         return Run(map_name, method, seed, from_tree(reduce(merge, layers, {})))
     except ConfigError as error:

@@ -89,18 +89,19 @@ def learners_place(request: launch.Request, nodes: Mapping[str, Mapping[str, flo
     Raises:
         LiirError: the directory is on a node that is not there.
     """
-    if request.resume:
-        endpoints = json.loads((request.run_dir / "endpoints.json").read_text())
-        address = endpoints["address"].rpartition(":")[0]
+    endpoints = request.run_dir / "endpoints.json"
+    if request.resume and endpoints.exists():  # not if it is restored from a backup, or never served
+        address = json.loads(endpoints.read_text())["address"].rpartition(":")[0]
         if address in nodes:
             return _on(f"node:{address}", nodes)
-        # Which, unlike the rest, is not copied here at the start.
+        # Which is not among what is copied here at the start.
         if not (request.run_dir / "state").exists():
             raise LiirError(
                 f"{request.run_dir} is on the disk of {address}, and only {', '.join(nodes)} are in the "
                 "cluster; bring it back, or copy the run directory to the head"
             )
-    elif request.config.learner.device != "cpu" and any(node.get("GPU") for node in nodes.values()):
+    gpu = request.config.learner.device != "cpu" and any(node.get("GPU") for node in nodes.values())
+    if gpu and not request.resume:
         return {"num_cpus": 0, "num_gpus": 1}
     return _on("node:__internal_head__", nodes)
 

@@ -119,6 +119,7 @@ class CheckpointService(checkpoint_pb2_grpc.CheckpointServiceServicer):
             if evaluation.episode in self.evaluations:
                 # Its checkpoint may be deleted by now.
                 _check_digest(evaluation, self.evaluations[evaluation.episode].sha256)
+                await self.changed()  # which the first report may not have come to
                 return checkpoint_pb2.ReportEvaluationResponse(duplicate=True)
             manifest = self._find(evaluation.episode)
             _check(evaluation, manifest, self._run.spec.info_keys)
@@ -161,11 +162,11 @@ class CheckpointService(checkpoint_pb2_grpc.CheckpointServiceServicer):
 
     def _delete_superseded(self) -> None:
         store = self._run.checkpoints
-        for episode in superseded(store.manifests, self.evaluations.merits, self._run.config):
-            try:
+        try:
+            for episode in superseded(store.manifests, self.evaluations.merits, self._run.config):
                 store.delete(episode)
-            except OSError as error:
-                log.warning("a checkpoint cannot be deleted", episode=episode, reason=str(error))
+        except OSError as error:  # with the next change they are tried again
+            log.warning("checkpoints cannot be deleted now", reason=str(error))
         metrics.CHECKPOINTS_DELETED.set(store.frozen - len(store.manifests))
 
     def _show_evaluations(self) -> None:

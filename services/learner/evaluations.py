@@ -53,18 +53,19 @@ class Evaluations:
 
     def add(self, evaluation: checkpoint_pb2.Evaluation, manifest: Manifest) -> None:
         """Store the first test of a checkpoint; if that fails all is as before."""
-        columns = self._table.columns
         try:
             start = self._table.append(_to_row(evaluation, manifest, self._begin))
             self._insert(evaluation.episode, start)
         finally:
-            if self._table.columns != columns:
+            if self._table.columns != self._columns:
                 self._find_rows()
 
     def _find_rows(self) -> None:
         self._episodes, self._starts = array("q"), array("q")
+        self._columns: list[str] = []
         for start, row in self._table.scan():
             self._insert(int(row["episode"]), start)
+        self._columns = self._table.columns
 
     def _insert(self, episode: int, start: int) -> None:
         position = bisect.bisect_left(self._episodes, episode)

@@ -87,8 +87,9 @@ def test_a_damaged_manifest_is_named(store: CheckpointStore, tmp_path: Path) -> 
     assert advice
     path.rename(path.with_name(advice[1]))
     again = CheckpointStore(str(path.parent))
-    assert (again.manifests, again.frozen) == ([], 1)
+    assert (again.manifests, again.frozen) == ([], 0)
     again.check_all([100])
+    assert not again.publish(make_manifest(100), DATA), "a resumed run that comes to it does without it, too"
 
 
 def test_weights_without_a_manifest_do_not_exist(store: CheckpointStore, tmp_path: Path) -> None:

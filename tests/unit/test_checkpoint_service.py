@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 from pathlib import Path
 
 import grpc
 import pytest
 
 from liir_common import config
+from liir_common.files import Table
 from liir_common.rpc.gen.liir.v1 import checkpoint_pb2
 from liir_common.rpc.refused import Refused
 from services.learner.checkpoint_service import CheckpointService
@@ -121,3 +123,27 @@ def test_evaluations_that_cannot_be_read_for_now_are_asked_for_again(path: Path)
     (path / "away").rename(table)
     assert served.listed() == [evaluation(100)]
     assert not served.report(evaluation(100))
+
+
+def test_who_waits_for_the_last_test_hears_of_it_from_its_second_report(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first one was stored, and then the disk could not be read."""
+
+    def fail(*_: object) -> None:
+        raise OSError(errno.EIO, "Input/output error")
+
+    async def report_twice() -> None:
+        waiting = asyncio.create_task(served.service.wait_all_evaluated())
+        await asyncio.sleep(0)
+        request = checkpoint_pb2.ReportEvaluationRequest(evaluation=evaluation(100))
+        with monkeypatch.context() as patch:
+            patch.setattr(Table, "read_at", fail)
+            with pytest.raises(Refused, match="Input/output"):
+                await served.service.ReportEvaluation(request, None)
+        assert (await served.service.ReportEvaluation(request, None)).duplicate
+        await asyncio.wait_for(waiting, 10)
+
+    served = Served(path)
+    served.freeze(100)
+    asyncio.run(report_twice())

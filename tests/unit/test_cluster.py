@@ -63,6 +63,11 @@ def test_a_resumed_run_goes_where_its_directory_is(tmp_path: Path) -> None:
     assert learners_place(resumed, {"10.0.0.1": HEAD})["resources"] == ON_HEAD
 
 
+def test_a_run_that_never_served_or_comes_from_a_backup_goes_to_the_head(tmp_path: Path) -> None:
+    nodes = {"10.0.0.1": HEAD, "10.0.0.2": WORKER | {"GPU": 1.0}}
+    assert learners_place(request(tmp_path, resume=True), nodes)["resources"] == ON_HEAD
+
+
 def test_tokens_of_the_environment_are_carried(monkeypatch: pytest.MonkeyPatch) -> None:
     line = f"operator {'x' * 32}"
     monkeypatch.setenv(VARIABLE, line)

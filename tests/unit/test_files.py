@@ -103,6 +103,7 @@ def test_keep_drops_what_a_resumed_run_writes_again(tmp_path: Path) -> None:
         ("step,x\n1,", None),
         ("step,x\n1,é\n", {"step": "1", "x": "é"}),
         ("step,x\n1,é\n2,b\n3", {"step": "2", "x": "b"}),
+        ("step,x\n1,é\n\n", {"step": "1", "x": "é"}),  # by an editor
     ],
 )
 def test_the_last_row_is_the_last_that_is_complete(

@@ -152,13 +152,11 @@ class Table:
         if not self.columns:
             return
         place = self.columns.index(column)
-        with self.path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-            end = len(data)
-            while start := data.rfind(b"\n", 0, end - 1) + 1:  # 0 for the line of the columns
-                cells = _cells(data[start:end])
-                if cells and int(cells[place]) <= at_most:
-                    break
-                end = start
+        end = complete_bytes(self.path)
+        for start, cells in _last_rows_first(self.path):
+            if int(cells[place]) <= at_most:
+                break
+            end = start
         os.truncate(self.path, end)
 
     def _row(self, line: bytes) -> dict[str, str]:
@@ -205,16 +203,21 @@ def read_table(path: Path) -> list[dict[str, str]]:
 
 def last_row(path: Path) -> dict[str, str] | None:
     """The last complete row of a CSV file, which may be long, and growing; None if there is none."""
-    end = complete_bytes(path) if path.exists() else 0
-    if not end:
+    if not path.exists():
         return None
-    with path.open("rb") as file, mmap.mmap(file.fileno(), end, access=mmap.ACCESS_READ) as data:
+    with path.open("rb") as file:
         columns = _cells(file.readline())
-        while start := data.rfind(b"\n", 0, end - 1) + 1:  # 0 for the line of the columns
-            if cells := _cells(data[start:end]):
-                return dict(zip(columns, cells, strict=True))
-            end = start
-    return None
+        return next((dict(zip(columns, row, strict=True)) for _, row in _last_rows_first(path)), None)
+
+
+def _last_rows_first(path: Path) -> Iterator[tuple[int, list[str]]]:
+    """Where each complete row of a CSV file begins, and its cells; nothing of the file is read but these."""
+    if end := complete_bytes(path):
+        with path.open("rb") as file, mmap.mmap(file.fileno(), end, access=mmap.ACCESS_READ) as data:
+            while start := data.rfind(b"\n", 0, end - 1) + 1:  # 0 for the line of the columns
+                if cells := _cells(data[start:end]):
+                    yield start, cells
+                end = start
 
 
 def complete_bytes(path: Path) -> int:

@@ -10,10 +10,10 @@ help: ## Show this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 18
 
 # Stamped, so that set-up costs nothing once the pinned requirements are in.
-$(VENV)/.installed: requirements.txt requirements-torch.txt requirements-dev.txt pyproject.toml
+$(VENV)/.installed: requirements.txt requirements-torch.txt requirements-torch-cpu.txt requirements-dev.txt pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --require-hashes -r requirements.txt
-	$(BIN)/pip install --quiet -r requirements-torch.txt
+	deploy/install-torch.sh $(BIN)/pip
 	# What comes as source is built with the setuptools just installed, not with one that nobody checked.
 	$(BIN)/pip install --quiet --require-hashes --no-build-isolation -r requirements-dev.txt
 	$(BIN)/pip install --quiet --no-deps --no-build-isolation -e .
@@ -69,12 +69,16 @@ dashboard: setup ## Write the Grafana dashboard from its program
 	$(BIN)/python deploy/grafana/dashboard.py > deploy/grafana/dashboards/liir.json
 
 PIN := UV_CUSTOM_COMPILE_COMMAND="make requirements" $(BIN)/uv pip compile --quiet --universal \
-	--python-version 3.11 --generate-hashes --no-annotate -c requirements-torch.txt --no-emit-package torch $(ARGS)
+	--python-version 3.11 --generate-hashes --no-annotate $(ARGS)
+PIN_REST := $(PIN) -c requirements-torch.in --no-emit-package torch
 requirements: setup ## Pin what pyproject.toml asks for, with hashes (ARGS="--upgrade" takes new versions)
-	$(PIN) pyproject.toml --group build --extra service --extra animation --extra export -o requirements.txt
-	$(PIN) --group dev -c requirements.txt -o requirements-dev.txt
-	for image in actor learner node; do $(PIN) pyproject.toml --group build --extra $$image -c requirements.txt \
+	$(PIN_REST) pyproject.toml --group build --extra service --extra animation --extra export -o requirements.txt
+	$(PIN_REST) --group dev -c requirements.txt -o requirements-dev.txt
+	for image in actor learner node; do $(PIN_REST) pyproject.toml --group build --extra $$image -c requirements.txt \
 		-o deploy/requirements-$$image.txt || exit; done
+	$(PIN_REST) --group aws -o deploy/requirements-aws.txt
+	# Not as pyproject.toml says that torch is: with what the usual build needs.
+	$(PIN) --no-config -c requirements.txt requirements-torch.in -o requirements-torch.txt
 
 lint: setup ## Check style, types, import rules and generated code
 	$(BIN)/ruff check .

@@ -60,7 +60,7 @@ class Manifest:
     @property
     def spec(self) -> EnvSpec:
         """The environment it was trained on."""
-        return EnvSpec(**{**self.env_spec, "info_keys": tuple(self.env_spec["info_keys"])})
+        return EnvSpec.of(self.env_spec)
 
     def to_json(self) -> str:
         """The manifest file's text."""

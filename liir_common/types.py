@@ -43,6 +43,11 @@ class EnvSpec:
     info_keys: tuple[str, ...]
     """Names of the end-of-episode figures; a game that can be won has "won" (0 or 1) among them."""
 
+    @classmethod
+    def of(cls, fields: Mapping[str, Any]) -> EnvSpec:
+        """The one whose fields came through JSON."""
+        return cls(**{**fields, "info_keys": tuple(fields["info_keys"])})
+
     @property
     def hash(self) -> str:
         """SHA-256 of all fields, as hex."""

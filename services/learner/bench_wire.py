@@ -3,30 +3,27 @@
 from __future__ import annotations
 
 import asyncio
-import multiprocessing
-import os
+import mmap
 import queue
+import subprocess
+import sys
+import tempfile
 import threading
 import time
-from collections.abc import AsyncIterator, Iterable, Iterator, MutableSequence
-from contextlib import asynccontextmanager
+from collections.abc import AsyncIterator, Sequence
+from contextlib import ExitStack, asynccontextmanager
 from dataclasses import dataclass
-from multiprocessing.context import SpawnProcess
 from statistics import median
-from typing import Any, NamedTuple
-
-import grpc
+from typing import Any
 
 from liir_common import config
-from liir_common.build import build
 from liir_common.rollout.play import env_spec, make_player
 from liir_common.rollout.policy import random_weights
 from liir_common.rpc import codec
-from liir_common.rpc.channel import CHANNEL_OPTIONS
 from liir_common.rpc.gen.liir.v1 import rollout_pb2, rollout_pb2_grpc
-from liir_common.rpc.requests import Outgoing, gather, put_together
 from liir_common.rpc.server import Server
 from liir_common.types import Exploration, Ticket, Trajectory, Weights
+from services.learner import bench_client
 from services.learner.bench import synthetic_batch
 from services.learner.compute import Compute
 from services.learner.intake import Opening
@@ -35,16 +32,7 @@ from services.learner.rollout_service import RolloutService
 
 _AHEAD = 8
 """Batches open at a time, so that no stream ever waits for the learner step that is left out."""
-
-
-class _Shared(NamedTuple):
-    """What the clients' processes have in common with this one."""
-
-    arrivals: MutableSequence[float]
-    """Per stream, when it got the newest policy, on the monotonic clock of all processes"""
-    together: Any
-    """Whether all wait with their answers for the last who gets a ticket: a shared boolean"""
-    barrier: threading.Barrier
+_POLL_S = 0.005
 
 
 @dataclass
@@ -54,7 +42,9 @@ class _Intake:
     service: RolloutService
     delivered: queue.SimpleQueue[list[Trajectory] | None]
     weights: Weights
-    shared: _Shared
+    clients: Sequence[subprocess.Popen[bytes]]
+    arrivals: Sequence[float]
+    """Per stream, when it got the newest policy, on the monotonic clock of all processes"""
     episode_bytes: int
     """Of the episode that answers every ticket"""
     opened: int = 0
@@ -68,47 +58,68 @@ class _Intake:
         """Wait until the oldest open batch has come in."""
         await asyncio.to_thread(self.delivered.get)
 
+    async def policy_arrived(self, begin: float) -> None:
+        """Wait until every stream has got a policy since `begin`."""
+        while min(self.arrivals) < begin:
+            await asyncio.sleep(_POLL_S)
+
+    def allow(self) -> None:
+        """Let every client answer the tickets that it was sent in one message."""
+        _write(self.clients, b".")
+
+    def allow_all(self) -> None:
+        """Let them answer whatever they are sent from now on."""
+        for client in self.clients:
+            assert client.stdin is not None
+            client.stdin.close()
+
 
 @asynccontextmanager
 async def _intake(settings: config.Config, streams: int, tickets: int) -> AsyncIterator[_Intake]:
-    """Clients are processes of their own, each with one stream that holds `tickets`, and answer every ticket
-    with the same real episode."""
+    """Clients are processes of their own, each with one stream that holds `tickets`, and answer a ticket with
+    the same real episode once they are allowed to."""
     spec = env_spec(settings.env)
     delivered: queue.SimpleQueue[list[Trajectory] | None] = queue.SimpleQueue()
     service = RolloutService(settings, spec, 0, delivered)
     server = Server("127.0.0.1", 0, settings.security)
     rollout_pb2_grpc.add_RolloutServiceServicer_to_server(service, server.grpc)
     await server.start()
-    spawn = multiprocessing.get_context("spawn")
-    arrivals: Any = spawn.Array("d", streams, lock=False)
-    shared = _Shared(arrivals, spawn.Value("b", False, lock=False), spawn.Barrier(streams))
-    address = f"127.0.0.1:{server.port}"
     # Played here: every client would load the compiled code, or compile it.
     episode = _episode(settings).SerializeToString()
-    clients = [
-        spawn.Process(target=_client, args=(address, spec.hash, tickets, episode, shared, i), daemon=True)
-        for i in range(streams)
-    ]
-    try:
-        # In a thread: gRPC cancels calls that wait half a minute for a loop that stands still.
-        await asyncio.to_thread(_start, clients)
-        while service.actors < streams:
-            if any(client.exitcode for client in clients):
-                raise RuntimeError("a client died before all had joined; its error is above")
-            await asyncio.sleep(0.1)
-        weights = random_weights(spec, settings.algorithm.policy_hidden, seed=0)
-        yield _Intake(service, delivered, weights, shared, len(episode))
-        await service.drain("measured", run_complete=True, grace_s=5.0)
-    finally:
-        for client in clients:
-            if client.pid is not None:
-                client.terminate()
-        await server.stop(0)
+    with ExitStack() as stack:
+        file = stack.enter_context(tempfile.TemporaryFile())
+        file.truncate(8 * streams)
+        clients = []
+        for index in range(streams):
+            arguments = [f"127.0.0.1:{server.port}", spec.hash, tickets, len(episode), file.fileno(), index]
+            client = stack.enter_context(_client(arguments, file.fileno()))
+            stack.callback(client.terminate)
+            clients.append(client)
+        try:
+            # In a thread, as they read it once they have started: gRPC cancels calls that wait half a minute
+            # for a loop that stands still.
+            await asyncio.to_thread(_write, clients, episode)
+            while service.actors < streams:
+                if any(client.poll() for client in clients):
+                    raise RuntimeError("a client died before all had joined; its error is above")
+                await asyncio.sleep(0.1)
+            weights = random_weights(spec, settings.algorithm.policy_hidden, seed=0)
+            arrivals = memoryview(mmap.mmap(file.fileno(), 0)).cast("d")
+            yield _Intake(service, delivered, weights, clients, arrivals, len(episode))
+            await service.drain("measured", run_complete=True, grace_s=5.0)
+        finally:
+            await server.stop(0)
 
 
-def _start(clients: Iterable[SpawnProcess]) -> None:
+def _client(arguments: Sequence[object], arrivals_fd: int) -> subprocess.Popen[bytes]:
+    command = [sys.executable, "-m", bench_client.__name__, *map(str, arguments)]
+    return subprocess.Popen(command, stdin=subprocess.PIPE, bufsize=0, pass_fds=[arrivals_fd])
+
+
+def _write(clients: Sequence[subprocess.Popen[bytes]], data: bytes) -> None:
     for client in clients:
-        client.start()
+        assert client.stdin is not None
+        client.stdin.write(data)
 
 
 def bench_wire(map_name: str, streams: int = 4, batches: int = 40, repeats: int = 5) -> dict[str, Any]:
@@ -120,6 +131,7 @@ def bench_wire(map_name: str, streams: int = 4, batches: int = 40, repeats: int 
     async def measure() -> tuple[list[float], list[float], int]:
         rates, costs = [], []
         async with _intake(settings, streams, _tickets(settings)) as intake:
+            intake.allow_all()
             for _ in range(_AHEAD):
                 intake.open()
             for repeat in range(repeats + 1):
@@ -151,14 +163,18 @@ def bench_policy(map_name: str, streams: int = 32, repeats: int = 100) -> dict[s
     settings = config.load(None, [f"env.map={map_name}", f"training.batch_episodes={streams}"])
 
     async def latencies(intake: _Intake, together: bool) -> list[float]:
-        intake.shared.together.value = together
+        if not together:
+            intake.allow_all()
         found = []
         for _ in range(repeats + 1):
             begin = time.monotonic()
             intake.open(intake.opened)
+            if together:
+                await intake.policy_arrived(begin)
+                intake.allow()
             await intake.next_batch()
-            assert min(intake.shared.arrivals) >= begin  # a ticket for each
-            found.append(max(intake.shared.arrivals) - begin)
+            assert min(intake.arrivals) >= begin  # a ticket for each
+            found.append(max(intake.arrivals) - begin)
         return found[1:]  # the first is the warm-up
 
     async def measure() -> tuple[list[float], list[float], int]:
@@ -216,6 +232,7 @@ def bench_beside(
         alone, beside = [], []
         with Compute(spec, settings) as learner:
             async with _intake(settings, streams, _tickets(settings)) as intake:
+                intake.allow_all()
                 for _ in range(3):  # in turns, for a machine that others use
                     alone.append(await measure(learner, intake, busy=False))
                     beside.append(await measure(learner, intake, busy=True))
@@ -240,30 +257,3 @@ def _episode(settings: config.Config) -> rollout_pb2.Trajectory:
     player.load(random_weights(player.spec, settings.algorithm.policy_hidden, seed=0))
     trajectory = player.play(Ticket.for_training(0, 0, 0, Exploration.SOFTMAX_FLOOR, 0.1))
     return codec.encode_trajectory(trajectory, rollout_pb2.ActorStats())
-
-
-def _client(address: str, spec_hash: str, tickets: int, episode: bytes, shared: _Shared, index: int) -> None:
-    trajectory = rollout_pb2.Trajectory.FromString(episode)
-    outgoing: Outgoing = queue.SimpleQueue()
-    hello = rollout_pb2.Hello(actor_id=f"bench-{os.getpid()}", env_spec_hash=spec_hash, build=build())
-    outgoing.put(rollout_pb2.PlayRequest(hello=hello, ready=rollout_pb2.Ready(tickets=tickets)))
-    with grpc.insecure_channel(address, options=CHANNEL_OPTIONS) as channel:
-        for message in rollout_pb2_grpc.RolloutServiceStub(channel).Play(put_together(outgoing)):
-            if message.HasField("drain"):
-                break
-            if message.HasField("policy"):
-                shared.arrivals[index] = time.monotonic()
-            if shared.together.value and message.tickets:
-                shared.barrier.wait()
-            for request in gather(_answers(trajectory, message.tickets)):
-                outgoing.put(request)
-    outgoing.put(None)  # ends the thread in which gRPC reads the queue
-
-
-def _answers(
-    trajectory: rollout_pb2.Trajectory, tickets: Iterable[rollout_pb2.Ticket]
-) -> Iterator[rollout_pb2.Trajectory]:
-    for ticket in tickets:
-        trajectory.episode_id = ticket.episode_id
-        trajectory.policy_version = ticket.policy_version
-        yield trajectory

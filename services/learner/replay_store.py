@@ -8,7 +8,7 @@ it.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +17,20 @@ from safetensors.numpy import load_file, save
 
 from liir_common.errors import CorruptError
 from liir_common.files import check_digest, write_digested
+from liir_common.types import Array
+
+
+def join(frames: Sequence[bytes]) -> dict[str, Array]:
+    """Frames as two arrays."""
+    data = np.frombuffer(b"".join(frames), np.uint8)
+    return {"frames": data, "sizes": np.array([len(frame) for frame in frames], np.int64)}
+
+
+def split(arrays: Mapping[str, Array]) -> list[bytes]:
+    """The frames that were joined."""
+    stops = arrays["sizes"].cumsum()
+    data = arrays["frames"].tobytes()
+    return [data[stop - size : stop] for stop, size in zip(stops, arrays["sizes"], strict=True)]
 
 
 class ReplayStore:
@@ -34,10 +48,8 @@ class ReplayStore:
     def append(self, first: int, frames: Sequence[bytes]) -> None:
         """Keep the episodes from `first` on."""
         if frames:
-            data = np.frombuffer(b"".join(frames), np.uint8)
-            sizes = np.array([len(frame) for frame in frames])
             name = f"replay-{first:09d}-{first + len(frames):09d}.safetensors"
-            write_digested(self._path / name, save({"frames": data, "sizes": sizes}))
+            write_digested(self._path / name, save(join(frames)))
 
     def load(self, first: int, stop: int) -> list[bytes]:
         """The episodes `first` … `stop` - 1; later ones, which no state knows, are removed.
@@ -76,11 +88,9 @@ class ReplayStore:
 def _read(path: Path) -> list[bytes]:
     try:
         check_digest(path)
-        arrays = load_file(path)
+        return split(load_file(path))
     except (SafetensorError, CorruptError) as error:
         raise CorruptError(
             f"{path} cannot be read ({error}); restore it from a backup, or remove all states to train "
             "from the start"
         ) from None
-    parts = np.split(arrays["frames"], arrays["sizes"].cumsum()[:-1])
-    return [part.tobytes() for part in parts]

@@ -105,22 +105,38 @@ def test_a_device_that_is_not_there_is_explained() -> None:
         Compute(SPEC, settings("learner.device=cuda"))
 
 
-def test_signals_are_for_the_learner_and_what_kills_it_is_told() -> None:
+def test_signals_are_for_the_learner_and_what_kills_it_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     with Compute(SPEC, settings()) as compute:
         for signum in (signal.SIGINT, signal.SIGTERM):  # as a terminal sends them, to all
             os.kill(compute.pid, signum)
         assert compute.parameter_counts()
-        with pytest.raises(ComputeError, match="gone: SIGKILL killed it during 'load_state'; resume the run"):
-            compute.load_state({"": Fatal()})  # type: ignore[dict-item]
+        receive = compute._link.receive
+
+        def kill_and_receive() -> object:
+            os.kill(compute.pid, signal.SIGKILL)
+            return receive()
+
+        os.kill(compute.pid, signal.SIGSTOP)  # so that it has not answered by then
+        monkeypatch.setattr(compute._link, "receive", kill_and_receive)
+        with pytest.raises(ComputeError, match="gone: SIGKILL killed it during 'state'; resume the run"):
+            compute.state()
         with pytest.raises(ComputeError, match="SIGKILL killed it before 'policy'"):
             compute.policy()
 
 
-class Fatal:
-    """Kills the process that receives it."""
+def test_nothing_that_json_cannot_say_is_sent() -> None:
+    with Compute(SPEC, settings()) as compute:
+        with pytest.raises(TypeError, match="not JSON serializable"):
+            compute.update(replace(batch_of(0), epsilon=object()))  # type: ignore[arg-type]
+        assert compute.update(batch_of(0))
 
-    def __reduce__(self) -> tuple[object, ...]:
-        return signal.raise_signal, (signal.SIGKILL,)
+
+def test_an_error_that_nobody_foresaw_says_what_it_was_there() -> None:
+    with Compute(SPEC, settings()) as compute:
+        with pytest.raises(RuntimeError, match="NotImplementedError: sing") as raised:
+            compute._ask("sing")
+        assert "in _do" in raised.value.__notes__[0]
+        assert compute.parameter_counts()
 
 
 def test_it_ends_with_whoever_started_it() -> None:

@@ -20,7 +20,14 @@ pytestmark = [pytest.mark.ray_submit, pytest.mark.timeout(1200)]
 
 ROOT = Path(__file__).parents[2]
 UPLOADED = ("liir_common", "services", "configs", "deploy")
-FILES = ("pyproject.toml", "requirements.txt", "requirements-torch.txt", "README.md", "LICENSE")
+FILES = (
+    "pyproject.toml",
+    "requirements.txt",
+    "requirements-torch.txt",
+    "requirements-torch-cpu.txt",
+    "README.md",
+    "LICENSE",
+)
 ACTORS = 4
 RUN = "runs/test"
 SETTINGS = (
@@ -77,7 +84,9 @@ class Cluster:
         cluster["auth"]["ssh_user"] = "root"
         cluster["worker_start_ray_commands"][-1] += f" --num-gpus={workers_gpus}"
         # They reach no registry, and have this machine's packages instead.
-        cluster["setup_commands"] = [line for line in cluster["setup_commands"] if " -r " not in line]
+        cluster["setup_commands"] = [
+            line for line in cluster["setup_commands"] if " -r " not in line and "install-torch" not in line
+        ]
         assert any("--no-deps" in line for line in cluster["setup_commands"])
         (folder / CLUSTER).write_text(yaml.safe_dump(cluster))
 

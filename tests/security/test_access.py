@@ -148,6 +148,13 @@ def test_every_method_that_is_served_has_its_line_in_the_table() -> None:
     assert not set(tokens.METHODS) & tokens.PUBLIC
 
 
+def test_a_reader_can_list_get_and_watch_and_nothing_else() -> None:
+    ours = {method for method in tokens.METHODS if method.startswith("/liir.")}
+    reads = {method for method in ours if re.match("List|Get|Watch", method.rpartition("/")[2])}
+    assert {method for method in ours if Role.READER in tokens.METHODS[method]} == reads
+    assert len(reads) == 6
+
+
 @needs_grpcurl
 def test_grpcurl_with_a_token(learner: str, certs: Path) -> None:
     reader = certs / "reader"

@@ -124,8 +124,11 @@ def test_what_a_cluster_file_sends_and_runs_exists(name: str) -> None:
 
 def test_both_clusters_set_up_the_same() -> None:
     ours, aws = map(read, CLUSTERS)
-    for key in ("file_mounts", "rsync_exclude", "worker_start_ray_commands"):
+    for key in ("rsync_exclude", "worker_start_ray_commands"):
         assert ours[key] == aws[key]
+    only_there = aws["file_mounts"].items() - ours["file_mounts"].items()
+    assert [here for _, here in only_there] == ["deploy/requirements-aws.txt"]
+    assert ours["file_mounts"].items() < aws["file_mounts"].items()
     assert ours["setup_commands"][1:] == aws["setup_commands"][1:]
 
 

@@ -19,6 +19,7 @@ from packaging.utils import canonicalize_name
 from tests.replays import publish
 
 ROOT = Path(__file__).parents[2]
+TORCH = "deploy/install-torch.sh"
 
 # The first argument names what must not be imported.
 BLOCKED = """
@@ -108,14 +109,53 @@ print(sum(1 for _ in Policy.load({str(path)!r}).play(parallel_env("3m"), seed=1)
 
 
 def test_every_pinned_requirement_has_a_hash_and_no_file_names_a_registry() -> None:
-    images = [f"deploy/requirements-{image}.txt" for image in ("actor", "learner", "node")]
-    for name in ("requirements.txt", "requirements-dev.txt", *images):
-        text = (ROOT / name).read_text()
+    files = sorted([*ROOT.glob("requirements*.txt"), *ROOT.glob("deploy/requirements*.txt")])
+    versions = set(re.findall("^torch==.*", (ROOT / "requirements-torch.in").read_text(), flags=re.M))
+    assert len(files) == 8
+    for path in files:
+        text = path.read_text()
         pins = re.split(r"^(?=[a-z])", text, flags=re.M)[1:]
-        assert len(pins) > 30
-        assert not [pin for pin in pins if pin.startswith("torch==")], "which the learner's images add"
+        assert pins
         assert all("==" in pin and "--hash=sha256:" in pin for pin in pins)
         assert "://" not in text
+        torch = {pin.split()[0].removesuffix("+cpu") for pin in pins if pin.startswith("torch==")}
+        assert torch == (versions if "torch" in path.name else set()), "one version, in files of its own"
+
+
+def test_nothing_is_installed_without_a_hash_but_ourselves() -> None:
+    files = ("Makefile", "deploy/Dockerfile", "deploy/cluster.yaml", "deploy/cluster.aws.yaml", TORCH)
+    texts = [(ROOT / name).read_text() for name in files]
+    commands = [
+        command for text in texts for command in re.findall(r'pip"? (?:install|wheel) [^&|;)\n]*', text)
+    ]
+    assert len(commands) == 19
+    assert not [command for command in commands if not re.search("--require-hashes|--no-deps", command)]
+
+
+@pytest.mark.parametrize(
+    ("build", "refusal"),
+    [("+cpu", "DO NOT MATCH THE HASHES"), ("", "No matching distribution found for cuda-bindings==")],
+)
+def test_a_torch_that_nobody_pinned_is_refused(tmp_path: Path, build: str, refusal: str) -> None:
+    """With CUDA's libraries or without depends on what pip is offered, not on what is installed."""
+    (version,) = re.findall("^torch==(.*)", (ROOT / "requirements-torch.in").read_text(), flags=re.M)
+    wheel, info = f"torch-{version}{build}", f"torch-{version}{build}.dist-info"
+    with zipfile.ZipFile(tmp_path / f"{wheel}-py3-none-any.whl", "w") as archive:
+        archive.writestr(
+            f"{info}/METADATA", f"Metadata-Version: 2.1\nName: torch\nVersion: {version}{build}\n"
+        )
+        archive.writestr(f"{info}/WHEEL", "Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: py3-none-any\n")
+        archive.writestr(f"{info}/RECORD", "")
+    offered = {"PIP_FIND_LINKS": str(tmp_path), "PIP_NO_INDEX": "1", "PIP_TARGET": str(tmp_path / "site")}
+    done = subprocess.run(
+        [ROOT / TORCH, Path(sys.executable).with_name("pip")],
+        capture_output=True,
+        text=True,
+        env=os.environ | offered | {"PIP_CONFIG_FILE": os.devnull},
+    )
+    assert done.returncode == 1
+    assert refusal in done.stderr
+    assert not (tmp_path / "site").exists()
 
 
 def test_the_wheel_holds_the_whole_package(tmp_path: Path) -> None:

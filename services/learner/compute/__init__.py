@@ -1,35 +1,42 @@
 """The learning rule in a process of its own, so that no update waits for what this one serves.
 
 The two processes speak over a pair of sockets that nobody else has: this one asks for one thing at a time,
-the other answers with it, or with the exception that it was. The other writes nothing, listens nowhere, and
-ends when this end is closed, however that came about.
+the other answers with it, or with what was raised. The other writes nothing, listens nowhere, and ends when
+this end is closed, however that came about.
 """
 
 from __future__ import annotations
 
 import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from enum import Enum, auto
-from multiprocessing import Pipe
+from dataclasses import asdict
+from enum import StrEnum
 from typing import Any, Self
 
-from liir_common import seeds
+import numpy as np
+
 from liir_common.config import Config
-from liir_common.errors import ComputeError
+from liir_common.errors import ComputeError, ConfigError
 from liir_common.types import Array, Batch, EnvSpec, Weights
+from services.learner.compute.link import NO_ARRAYS, Link
+from services.learner.replay_store import join, split
 
 _COMMAND = (sys.executable, "-m", __name__)
 _END_S = 10.0
+_ERRORS = {kind.__name__: kind for kind in (ConfigError, FloatingPointError, ValueError)}
+"""What an algorithm is expected to raise; anything else is a RuntimeError here."""
 
 
-class Answer(Enum):
+class Answer(StrEnum):
     """What comes back."""
 
-    VALUE = auto()
-    ERROR = auto()
-    POLICY = auto()
+    VALUE = "value"
+    ERROR = "error"
+    """What was raised: its class, its text, and its traceback, which would stay behind"""
+    POLICY = "policy"
     """The update goes on, this is the policy that it leaves"""
 
 
@@ -45,13 +52,13 @@ class Compute:
         Raises:
             ConfigError: the device is not there.
         """
-        self._connection, theirs = Pipe()
+        ours, theirs = socket.socketpair()
         with theirs:
             end = theirs.fileno()
             self._process = subprocess.Popen([*_COMMAND, str(end)], pass_fds=[end])
-        seed = seeds.derive(config.seed, seeds.LEARNER)
+        self._link = Link(ours)
         try:
-            has_replay = self._ask("make", spec, config.algorithm, seed, config.learner)
+            has_replay, _ = self._ask("make", {"spec": asdict(spec), "config": config.shared_tree()})
         except BaseException:
             self.close()
             raise
@@ -70,57 +77,60 @@ class Compute:
 
     def close(self) -> None:
         """End the process; no thread may be waiting for an answer."""
-        self._connection.close()
+        self._link.close()
         self._end()
 
     def policy(self) -> Weights:
         """As `Algorithm.policy`."""
-        weights: Weights = self._ask("policy")
-        return weights
+        return self._ask("policy")[1]
 
     def intrinsic(self) -> Weights:
         """As `Algorithm.intrinsic`."""
-        weights: Weights = self._ask("intrinsic")
-        return weights
+        return self._ask("intrinsic")[1]
 
     def update(
         self, batch: Batch, policy_ready: Callable[[Weights], None] = lambda _: None
     ) -> dict[str, float]:
         """As `Algorithm.update`."""
-        figures: dict[str, float] = self._ask("update", batch, policy_ready=policy_ready)
+        arrays = {name: value for name, value in vars(batch).items() if isinstance(value, np.ndarray)}
+        numbers = {name: value for name, value in vars(batch).items() if name not in arrays}
+        figures: dict[str, float] = self._ask("update", numbers, arrays, policy_ready)[0]
         return figures
 
     def state(self) -> dict[str, Array]:
         """As `Algorithm.state`."""
-        state: dict[str, Array] = self._ask("state")
-        return state
+        return self._ask("state")[1]
 
     def load_state(self, state: Mapping[str, Array]) -> None:
         """As `Algorithm.load_state`."""
-        self._ask("load_state", state)
+        self._ask("load_state", arrays=state)
 
     def parameter_counts(self) -> dict[str, int]:
         """As `Algorithm.parameter_counts`."""
-        counts: dict[str, int] = self._ask("parameter_counts")
+        counts: dict[str, int] = self._ask("parameter_counts")[0]
         return counts
 
     def _ask(
-        self, what: str, *arguments: object, policy_ready: Callable[[Weights], None] = lambda _: None
-    ) -> Any:
+        self,
+        what: str,
+        value: object = None,
+        arrays: Mapping[str, Array] = NO_ARRAYS,
+        policy_ready: Callable[[Weights], None] = lambda _: None,
+    ) -> tuple[Any, dict[str, Array]]:
         try:
-            self._connection.send((what, arguments))
+            self._link.send([what, value], arrays)
         except OSError:
             raise self._death(f"before {what!r}") from None
         while True:
             try:
-                answer, value = self._connection.recv()
+                (answer, got), got_arrays = self._link.receive()
             except (EOFError, OSError):
                 raise self._death(f"during {what!r}") from None
-            if answer is Answer.VALUE:
-                return value
-            if answer is Answer.ERROR:
-                raise value
-            policy_ready(value)
+            if answer == Answer.VALUE:
+                return got, got_arrays
+            if answer == Answer.ERROR:
+                raise _error(*got)
+            policy_ready(got_arrays)
 
     def _end(self) -> int:
         """The code that the process ends with, now that one side of the connection is closed."""
@@ -142,19 +152,25 @@ class Compute:
 class _Replay:
     """The replay of the algorithm there."""
 
-    def __init__(self, ask: Callable[..., Any]) -> None:
+    def __init__(self, ask: Callable[..., tuple[Any, dict[str, Array]]]) -> None:
         self._ask = ask
 
     @property
     def first(self) -> int:
         """As `Replay.first`."""
-        return int(self._ask("replay.first"))
+        return int(self._ask("replay.first")[0])
 
     def frames(self, first: int) -> list[bytes]:
         """As `Replay.frames`."""
-        frames: list[bytes] = self._ask("replay.frames", first)
-        return frames
+        return split(self._ask("replay.frames", first)[1])
 
     def restore(self, total: int, frames: Sequence[bytes]) -> None:
         """As `Replay.restore`."""
-        self._ask("replay.restore", total, frames)
+        self._ask("replay.restore", total, join(frames))
+
+
+def _error(kind: str, text: str, trace: str) -> Exception:
+    known = _ERRORS.get(kind)
+    error = RuntimeError(f"{kind}: {text}") if known is None else known(text)
+    error.add_note(f"There:\n{trace}")
+    return error

@@ -3,75 +3,107 @@
 from __future__ import annotations
 
 import signal
+import socket
 import sys
 import traceback
-from collections.abc import Callable
-from contextlib import suppress
-from multiprocessing.connection import Connection
-from operator import attrgetter
+from collections.abc import Callable, Mapping
+from contextlib import closing, suppress
 from typing import Any
 
 import torch
 
-from liir_common.config import AlgorithmConfig, LearnerConfig
+from liir_common import seeds
+from liir_common.config import Config, from_tree
 from liir_common.errors import ConfigError
-from liir_common.types import EnvSpec, Weights
-from services.learner.algorithms import Algorithm, make_algorithm
+from liir_common.types import Array, Batch, EnvSpec, Weights
+from services.learner.algorithms import Algorithm, SavedReplay, make_algorithm
 from services.learner.compute import Answer
+from services.learner.compute.link import NO_ARRAYS, Link
 from services.learner.memory import keep_memory
+from services.learner.replay_store import join, split
+
+Make = Callable[[EnvSpec, Config], Algorithm]
 
 
-def main(make: Callable[..., Algorithm]) -> None:
+def main(make: Make) -> None:
     """Answer with what `make` gives until the other end is closed; signals are for the process there."""
     for signum in (signal.SIGINT, signal.SIGTERM):
         signal.signal(signum, signal.SIG_IGN)
-    with Connection(int(sys.argv[1])) as connection, suppress(EOFError, ConnectionError):
-        worker = Worker(connection, make)
+    end = socket.socket(fileno=int(sys.argv[1]))
+    with closing(Link(end)) as link, suppress(EOFError, ConnectionError):
+        worker = Worker(link, make)
         while True:
-            worker.answer(*connection.recv())
+            (what, value), arrays = link.receive()
+            worker.answer(what, value, arrays)
 
 
 class Worker:
     """Does what it is asked for with the algorithm that it was first asked to make."""
 
-    def __init__(self, connection: Connection, make: Callable[..., Algorithm]) -> None:
-        """Nothing is there until "make" is asked for, whose arguments are those of `make`."""
-        self._connection = connection
+    def __init__(self, link: Link, make: Make) -> None:
+        """Nothing is there until "make" is asked for."""
+        self._link = link
         self._make = make
         self._algorithm: Algorithm
 
-    def answer(self, what: str, arguments: tuple[Any, ...]) -> None:
+    def answer(self, what: str, value: Any, arrays: Mapping[str, Array]) -> None:
         """Do it, and send what came of it."""
         try:
-            answer = Answer.VALUE, self._do(what, arguments)
+            got, got_arrays = self._do(what, value, arrays)
         except Exception as error:
-            error.add_note(f"There:\n{traceback.format_exc()}")  # which would stay behind
-            answer = Answer.ERROR, error
-        self._connection.send(answer)
+            raised = [type(error).__name__, str(error), traceback.format_exc()]
+            self._link.send([Answer.ERROR, raised])
+        else:
+            self._link.send([Answer.VALUE, got], got_arrays)
 
-    def _do(self, what: str, arguments: tuple[Any, ...]) -> Any:
+    def _do(self, what: str, value: Any, arrays: Mapping[str, Array]) -> tuple[Any, Mapping[str, Array]]:
         if what == "make":
-            self._algorithm = self._make(*arguments)
-            return self._algorithm.replay is not None
-        if what == "update":
-            (batch,) = arguments
-            return self._algorithm.update(batch, self._policy_ready)
-        found = attrgetter(what)(self._algorithm)
-        return found(*arguments) if callable(found) else found
+            self._algorithm = self._make(EnvSpec.of(value["spec"]), from_tree(value["config"]))
+            return self._algorithm.replay is not None, NO_ARRAYS
+        algorithm = self._algorithm
+        match what:
+            case "policy":
+                return None, algorithm.policy()
+            case "intrinsic":
+                return None, algorithm.intrinsic()
+            case "update":
+                return algorithm.update(Batch(**value | arrays), self._policy_ready), NO_ARRAYS
+            case "state":
+                return None, algorithm.state()
+            case "load_state":
+                algorithm.load_state(arrays)
+                return None, NO_ARRAYS
+            case "parameter_counts":
+                return algorithm.parameter_counts(), NO_ARRAYS
+            case "replay.first":
+                return self._replay.first, NO_ARRAYS
+            case "replay.frames":
+                return None, join(self._replay.frames(value))
+            case "replay.restore":
+                self._replay.restore(value, split(arrays))
+                return None, NO_ARRAYS
+        raise NotImplementedError(what)
+
+    @property
+    def _replay(self) -> SavedReplay:
+        replay = self._algorithm.replay
+        assert replay is not None, "asked for only where there is one"
+        return replay
 
     def _policy_ready(self, weights: Weights) -> None:
-        self._connection.send((Answer.POLICY, weights))
+        self._link.send([Answer.POLICY, None], weights)
 
 
-def make(spec: EnvSpec, config: AlgorithmConfig, seed: int, learner: LearnerConfig) -> Algorithm:
+def make(spec: EnvSpec, config: Config) -> Algorithm:
     """The algorithm on its device, in a process set up for it.
 
     Raises:
         ConfigError: that device is not there.
     """
     keep_memory()
-    torch.set_num_threads(learner.threads)
-    return make_algorithm(spec, config, seed, device(learner.device))
+    torch.set_num_threads(config.learner.threads)
+    seed = seeds.derive(config.seed, seeds.LEARNER)
+    return make_algorithm(spec, config.algorithm, seed, device(config.learner.device))
 
 
 def device(name: str) -> torch.device:

@@ -1,8 +1,9 @@
 """`liir backup`: a copy of a run that may go on meanwhile, from which the run can be resumed.
 
-A state counts checkpoints and learner steps and needs episodes of the replay, and a checkpoint is deleted
-only after its test is in evaluations.csv. So the state is read first and the tables last: what is read later
-may know more, never less, than what counts on it.
+A state counts checkpoints and learner steps and needs episodes of the replay; before a checkpoint is deleted
+its test is in evaluations.csv and then a line of it in deleted.csv. So the state is read first, then the
+checkpoints, then deleted.csv, and the other tables last: what is read later may know more, never less, than
+what counts on it.
 """
 
 from __future__ import annotations
@@ -65,16 +66,13 @@ def _state(folder: Path, stack: ExitStack) -> list[Member]:
 
 
 def _checkpoints(folder: Path) -> Iterator[Member]:
-    """The manifests, of deleted ones, too, and the weights."""
-    seen: set[Path] = set()
-    for _ in range(2):  # what is deleted during the first round has another name in the second
-        manifests = set(folder.glob("*.json")) - seen
-        for manifest in sorted(manifests):
-            # In this order: weights are removed only after their manifest got its other name.
-            for path in (manifest.with_suffix(".safetensors"), manifest):
-                with suppress(FileNotFoundError):
-                    yield _whole(path)
-        seen |= manifests
+    for manifest in sorted(folder.glob("*.json")):
+        # In this order: weights are removed after their manifest.
+        for path in (manifest.with_suffix(".safetensors"), manifest):
+            with suppress(FileNotFoundError):  # deleted meanwhile
+                yield _whole(path)
+    with suppress(FileNotFoundError):  # none was ever
+        yield _whole(folder / "deleted.csv")
 
 
 def _whole(path: Path) -> Member:

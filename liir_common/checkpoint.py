@@ -1,9 +1,8 @@
 """Frozen checkpoints: a weights file in safetensors and a manifest that names its SHA-256.
 
-The manifest is written last, so a checkpoint exists exactly when its manifest does. One that was deleted has
-its manifest under another name, `deleted-EPISODE-SHA256.json`, so that a resumed run that comes to it again
-neither freezes it anew nor differs from it unnoticed; the name says enough for that, and the file is not
-read. A store may be a folder or any URL that fsspec knows.
+The manifest is written last, so a checkpoint exists exactly when its manifest does. Before one is deleted
+`deleted.csv` gets a line, its episode and SHA-256, so that a resumed run that comes to it again neither
+freezes it anew nor differs from it unnoticed. A store may be a folder or any URL that fsspec knows.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ import json
 import re
 import threading
 from array import array
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from operator import attrgetter
 from pathlib import Path
@@ -27,7 +26,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from liir_common.errors import CorruptError
-from liir_common.files import write_atomic
+from liir_common.files import append_line, write_atomic
 from liir_common.types import EnvSpec
 
 Tensors = Mapping[str, NDArray[np.float32]]
@@ -120,11 +119,11 @@ class CheckpointStore:
             self._manifests.append(
                 _sharing(self._read_manifest(self._manifest_path(episode)), self._manifests)
             )
-        deleted = _episodes(names, r"deleted-(\d+)(?:-\w+)?\.json") - kept  # older builds put no digest there
-        # Of the many that a long run deletes, a number each is in memory; their names have the digests.
-        self._deleted = array("q", sorted(deleted))
-        self._left_over = _episodes(names, r"checkpoint-(\d+)\.safetensors") & deleted
-        self._lost = len(_episodes(names, rf"deleted-(\d+)-{_LOST}\.json"))
+        # Of the many that a long run deletes, a number each is in memory.
+        digests = {episode: sha256 for episode, sha256 in self._deletions() if episode not in kept}
+        self._deleted = array("q", sorted(digests))
+        self._left_over = _episodes(names, r"checkpoint-(\d+)\.safetensors") & digests.keys()
+        self._lost = [*digests.values()].count(_LOST)
 
     @property
     def manifests(self) -> list[Manifest]:
@@ -167,7 +166,8 @@ class CheckpointStore:
         Raises:
             KeyError: there is no such checkpoint.
         """
-        self._fs.mv(self._manifest_path(episode), self._deleted_path(self.find(episode)))
+        self._append_deletion(self.find(episode))
+        self._fs.rm(self._manifest_path(episode))
         with self._lock:
             bisect.insort(self._deleted, episode)
             self._manifests = [other for other in self._manifests if other.episode != episode]
@@ -203,8 +203,8 @@ class CheckpointStore:
         if missing.size:
             raise CorruptError(
                 f"{missing.size} checkpoints, from {missing[0]} on, are missing under {self._root}; restore "
-                f"them from a backup, or make an empty file deleted-{missing[0]:09d}-{_LOST}.json there for "
-                "each to go on without them"
+                f"them from a backup, or append a line {missing[0]},{_LOST} to {self._deleted_path} for each "
+                "to go on without them"
             )
 
     def read(self, manifest: Manifest) -> bytes:
@@ -235,29 +235,44 @@ class CheckpointStore:
             return there.sha256
         if not self._was_deleted(manifest.episode):
             return ""
-        if self._fs.exists(self._deleted_path(manifest)):  # which takes no look through all the names
-            return manifest.sha256
-        for path in self._fs.glob(f"{self._root}/deleted-{manifest.episode:09d}[-.]*json"):
-            named = re.search(r"deleted-\d+-(\w+)\.json$", path)
-            if named and named[1] == _LOST:
-                return manifest.sha256
-            return named[1] if named else self._read_manifest(path).sha256
-        return ""  # somebody has removed it
+        digests = [sha256 for episode, sha256 in self._deletions() if episode == manifest.episode]
+        return manifest.sha256 if _LOST in digests else [manifest.sha256, *digests][-1]
+
+    def _deletions(self) -> Iterator[tuple[int, str]]:
+        """Episode and digest of all that were deleted; of one that was put back there may be more."""
+        if not self._fs.exists(self._deleted_path):
+            return
+        with self._fs.open(self._deleted_path, "r") as file:
+            for line in file:
+                # Else it is the header, or what a dying process left; then the checkpoint is still there.
+                if match := re.fullmatch(r"(\d+),(\w+)", line.strip()):
+                    yield int(match[1]), match[2]
+
+    def _append_deletion(self, manifest: Manifest) -> None:
+        path, line = self._deleted_path, f"{manifest.episode},{manifest.sha256}"
+        if not self._fs.exists(path):
+            self._write(path, f"episode,sha256\n{line}\n".encode())
+        elif "file" in self._fs.protocol:
+            append_line(Path(path), line)
+        else:
+            self._fs.pipe_file(path, self._fs.cat_file(path) + f"{line}\n".encode())
 
     def _read_manifest(self, path: str) -> Manifest:
         try:
             return Manifest.from_json(self._fs.cat_file(path).decode())
         except (CorruptError, UnicodeDecodeError) as error:
-            name = re.sub(r".*-(\d+)\.json", rf"deleted-\1-{_LOST}.json", path)
+            (episode,) = _episodes([path.rpartition("/")[2]], r"checkpoint-(\d+)\.json")
             raise CorruptError(
-                f"{path}: {error}; restore it from a backup, or rename it to {name} to go on without it"
+                f"{path}: {error}; restore it from a backup, or remove it and append a line "
+                f"{episode},{_LOST} to {self._deleted_path} to go on without it"
             ) from None
 
     def _weights_path(self, episode: int) -> str:
         return f"{self._root}/checkpoint-{episode:09d}.safetensors"
 
-    def _deleted_path(self, manifest: Manifest) -> str:
-        return f"{self._root}/deleted-{manifest.episode:09d}-{manifest.sha256}.json"
+    @property
+    def _deleted_path(self) -> str:
+        return f"{self._root}/deleted.csv"
 
     def _manifest_path(self, episode: int) -> str:
         return f"{self._root}/checkpoint-{episode:09d}.json"

@@ -23,10 +23,17 @@ _DIGEST_DIGITS = 16
 
 def write_atomic(path: Path, data: bytes, mode: int = 0o644) -> None:
     """Replace `path` by `data`, on disk before the name changes; the default lets other users read it."""
+    with _replaced(path, mode) as file:
+        file.write(data)
+
+
+@contextmanager
+def _replaced(path: Path, mode: int = 0o644) -> Iterator[BinaryIO]:
+    """What is written in the block becomes `path`, if all of it can be written."""
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
         with os.fdopen(handle, "wb") as file:
-            file.write(data)
+            yield file
             file.flush()
             os.fsync(file.fileno())
             os.fchmod(file.fileno(), mode)
@@ -142,7 +149,7 @@ class Table:
         """
         new = [column for column in row if column not in self.columns]
         if new:
-            self._rewrite(self.read(), [*self.columns, *new])
+            self._widen(new)
         text = io.StringIO()
         csv.DictWriter(text, self.columns, lineterminator="\n").writerow(row)
         return _append_whole(self.path, text.getvalue().encode())
@@ -162,8 +169,17 @@ class Table:
     def _row(self, line: bytes) -> dict[str, str]:
         return dict(zip(self.columns, _cells(line), strict=True))
 
-    def _rewrite(self, rows: list[dict[str, str]], columns: list[str]) -> None:
-        write_atomic(self.path, csv_text(rows, columns).encode())
+    def _widen(self, new: list[str]) -> None:
+        """Give all rows empty cells under new columns, one row in memory at a time."""
+        columns = [*self.columns, *new]
+        with _replaced(self.path) as file:
+            file.write(csv_text([], columns).encode())
+            if self.columns:
+                with self.path.open("rb") as old:
+                    old.readline()
+                    file.writelines(
+                        line.rstrip(b"\n") + b"," * len(new) + b"\n" for line in old if line.strip()
+                    )
         self.columns = columns
 
 
@@ -171,13 +187,22 @@ def _cells(line: bytes) -> list[str]:
     return next(csv.reader([line.decode()]), [])
 
 
-def _append_whole(path: Path, data: bytes) -> int:
+def append_line(path: Path, line: str) -> None:
+    """Append to a file that is there, on disk when this returns; a line left half-written stays one."""
+    unfinished = path.stat().st_size > complete_bytes(path)
+    start = "\n" if unfinished else ""
+    _append_whole(path, f"{start}{line}\n".encode(), durable=True)
+
+
+def _append_whole(path: Path, data: bytes, durable: bool = False) -> int:
     """Append all of `data` or, where the disk is full, nothing; returns where it begins."""
     with path.open("ab", buffering=0) as file:
         end = file.seek(0, os.SEEK_END)
         try:
             if file.write(data) < len(data):
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+            if durable:
+                os.fsync(file.fileno())
         except OSError:
             file.truncate(end)
             raise

@@ -1,4 +1,4 @@
-"""What work leaves in memory."""
+"""What work takes of memory, and leaves there."""
 
 import gc
 import pathlib
@@ -14,5 +14,15 @@ def bytes_left(work: Callable[[], None]) -> int:
         gc.collect()
         left = tracemalloc.take_snapshot().filter_traces([tracemalloc.Filter(False, pathlib.__file__)])
         return sum(trace.size for trace in left.traces)
+    finally:
+        tracemalloc.stop()
+
+
+def bytes_at_peak(work: Callable[[], object]) -> int:
+    """The most that Python has allocated at a time meanwhile."""
+    tracemalloc.start()
+    try:
+        work()
+        return tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()

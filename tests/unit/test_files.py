@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from liir_common.files import Table, last_row, remove_leftovers, write_atomic
+from tests.traced import bytes_at_peak
 
 
 def test_a_failed_write_leaves_the_old_content_and_nothing_else(
@@ -75,6 +76,19 @@ def test_rows_may_bring_and_lack_columns(tmp_path: Path) -> None:
     table.append({"step": 2, "x": 0.5})
     Table(path).append({"step": 3})
     assert path.read_text().splitlines() == ["step,x", "1,", "2,0.5", "3,"]
+
+
+def test_a_long_table_that_gets_new_columns_is_not_in_memory(tmp_path: Path) -> None:
+    path = tmp_path / "table.csv"
+    rows = 100_000
+    path.write_text("a,b\n" + "".join(f"{i},{i + 1}\n" for i in range(rows)))
+    table = Table(path)
+    assert bytes_at_peak(lambda: table.append({"c": 5, "d": 6})) < 300_000 < path.stat().st_size
+    assert table.read()[-2:] == [
+        {"a": f"{rows - 1}", "b": f"{rows}", "c": "", "d": ""},
+        {"a": "", "b": "", "c": "5", "d": "6"},
+    ]
+    assert len(table.read()) == rows + 1
 
 
 def test_keep_drops_what_a_resumed_run_writes_again(tmp_path: Path) -> None:

@@ -9,8 +9,10 @@ The roles are `learner`, which has everybody's tokens, and those of `Role`, whic
 from __future__ import annotations
 
 import ipaddress
+import re
 import secrets
 from collections.abc import Sequence
+from contextlib import suppress
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -34,6 +36,7 @@ _CA_DAYS, _DAYS = 3650, 365
 _CLOCK_SKEW = timedelta(days=2)
 """New certificates hold for a machine whose clock is as much slow."""
 _PRIVATE = 0o600
+_HOST_NAME = re.compile(r"(\*\.)?[A-Za-z0-9_-]{1,63}(\.[A-Za-z0-9_-]{1,63})*")
 _TOKEN_BYTES = 32
 
 
@@ -44,12 +47,12 @@ def make_certs(folder: Path, hosts: Sequence[str] = ()) -> None:
     machine's loopback names and for `hosts`, names or IP addresses.
 
     Raises:
-        ConfigError: the CA or the learner's tokens in `folder` cannot be used.
+        ConfigError: the CA or the learner's tokens in `folder` cannot be used, or a host is none.
     """
+    names = [_general_name(host) for host in dict.fromkeys((*LOCAL_HOSTS, *hosts))]
     for role in ("learner", *Role):
         (folder / role).mkdir(parents=True, exist_ok=True)
     ca, ca_key = _load_ca(folder) if (folder / "ca.pem").exists() else _make_ca(folder)
-    names = [_general_name(host) for host in dict.fromkeys((*LOCAL_HOSTS, *hosts))]
     # `liir train` shows the learner's certificate as a client, too: its processes share one configuration.
     both = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]
     _issue(folder / "learner", ca, ca_key, both, names)
@@ -71,10 +74,11 @@ def _hand_out_tokens(folder: Path) -> None:
 
 
 def _general_name(host: str) -> x509.GeneralName:
-    try:
+    with suppress(ValueError):
         return x509.IPAddress(ipaddress.ip_address(host))
-    except ValueError:
-        return x509.DNSName(host)
+    if not _HOST_NAME.fullmatch(host):
+        raise ConfigError(f"wanted a host's name or IP address without a port, got {host!r}")
+    return x509.DNSName(host)
 
 
 def _make_ca(folder: Path) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:

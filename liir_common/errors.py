@@ -46,7 +46,7 @@ class RefusedError(LiirError):
 
 
 class StorageError(LiirError):
-    """The run directory cannot be written to."""
+    """The run directory, or what a command was to write, cannot be written to."""
 
     exit_code = 6
 
@@ -98,8 +98,8 @@ def say(line: str) -> None:
 
 
 @contextmanager
-def storage_explained(path: Path) -> Iterator[None]:
-    """Turn an `OSError` of writing under `path` into a `StorageError` that says what to do.
+def storage_explained(path: Path, then: str = "resume the run") -> Iterator[None]:
+    """Turn an `OSError` of writing under `path` into a `StorageError` that says what to do, and `then` what.
 
     Raises:
         DiskFullError: the disk or the user's quota is full.
@@ -110,8 +110,7 @@ def storage_explained(path: Path) -> Iterator[None]:
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             raise DiskFullError(
-                f"cannot write to {path}: {error.strerror}; free some space on its disk, then resume the run"
+                f"cannot write to {path}: {error.strerror}; free some space on its disk, then {then}"
             ) from error
-        raise StorageError(
-            f"cannot write to {error.filename or path}: {error.strerror}; mend that, then resume the run"
-        ) from error
+        what = f"use {error.filename}" if error.filename else f"write to {path}"
+        raise StorageError(f"cannot {what}: {error.strerror}; mend that, then {then}") from error

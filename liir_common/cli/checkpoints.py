@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from liir_common import options
-from liir_common.cli.shared import Output
+from liir_common.cli.shared import Output, written
 from liir_common.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -77,7 +77,7 @@ def get_checkpoint(
     settings: options.Settings = None,
 ) -> None:
     """Download a checkpoint: its weights (safetensors) and its manifest (JSON), checked; goes on if cut."""
-    with _checkpoints(learner, map_name, config, settings) as client:
+    with _checkpoints(learner, map_name, config, settings) as client, written(output):
         print(client.save(episode, output))
 
 
@@ -98,7 +98,8 @@ def best_checkpoint(
         )
         print(f"{_line(client.find(tested.episode))}  won {wins}; return {tested.greedy.return_mean:.2f}")
         if output is not None:
-            print(client.save(tested.episode, output))
+            with written(output):
+                print(client.save(tested.episode, output))
 
 
 def _line(frozen: Any) -> str:
@@ -120,5 +121,7 @@ def export_policy(
 
     if not output.parent.is_dir():
         raise ConfigError(f"{output.parent} is no folder; make it first")
-    write_atomic(output, to_onnx(*load_checkpoint(checkpoint)))
+    graph = to_onnx(*load_checkpoint(checkpoint))
+    with written(output):
+        write_atomic(output, graph)
     print(output)

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from liir_common import options
-from liir_common.cli.shared import Output, names, numbers
+from liir_common.cli.shared import Output, names, numbers, written
 from liir_common.errors import ConfigError
 
 app = typer.Typer()
@@ -66,7 +66,8 @@ def report(
             raise ConfigError(f"{run_dir} holds no run")
         print_summary(run_dir, write_report(run_dir))
     if output is not None:
-        write_results(run_dirs, output)
+        with written(output):
+            write_results(run_dirs, output)
 
 
 @app.command()
@@ -95,7 +96,8 @@ def replay(
     check_output(output)
     manifest, tensors = load_checkpoint(find_checkpoint(checkpoint, run_dir, best))
     recording = record(manifest, tensors, seed, sampled, map_name)
-    write(recording, output)
+    with written(output):
+        write(recording, output)
     trajectory = recording.trajectory
     result = "won" if trajectory.info["won"] else "not won"
     print(f"{output}: {recording.map_name}, {result} after {trajectory.length} steps")
@@ -117,7 +119,9 @@ def figure_2(
 
     runs = plan(file, seeds=numbers(seeds), settings=settings or ())
     _sweep(runs, output, jobs)
-    for method, found in write_figure(runs, output, output)["methods"].items():
+    with written(output):
+        methods = write_figure(runs, output, output)["methods"]
+    for method, found in methods.items():
         for policy, auc in found["auc"].items():
             print(f"{method:10} AUC on actions of the {policy:8} policy: " + _of(auc))
     print(output / "figure2.png")
@@ -136,7 +140,9 @@ def figure_3(
     from liir_common.figures.curves import markdown, write_figure
     from liir_common.results import read_curves
 
-    print(markdown(write_figure(read_curves(sources), output)), end="")
+    curves = read_curves(sources)
+    with written(output):
+        print(markdown(write_figure(curves, output)), end="")
     print(output / "figure3.png")
 
 
@@ -147,7 +153,9 @@ def _battle_figure(
     from liir_common.figures.run import load
 
     mode = "sampled" if sampled else "greedy"
-    figures = write_figure(load(run_dir, checkpoint), name, output, episode, mode, numbers(marks))
+    run = load(run_dir, checkpoint)
+    with written(output):
+        figures = write_figure(run, name, output, episode, mode, numbers(marks))
     for step, why in figures["marks"].items():
         print(f"step {step}: {why}")
     print(output / f"{name}.png")
@@ -197,4 +205,6 @@ def figure_cosine(
     from liir_common.figures.run import load
 
     mode = "sampled" if sampled else "greedy"
-    print(describe(write_figure(load(run_dir, checkpoint), output, episodes, mode)), end="")
+    run = load(run_dir, checkpoint)
+    with written(output):
+        print(describe(write_figure(run, output, episodes, mode)), end="")

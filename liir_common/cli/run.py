@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from liir_common import options
+from liir_common.cli.shared import written
 from liir_common.errors import ConfigError, UnreachableError
 
 app = typer.Typer()
@@ -111,7 +112,9 @@ def backup(
 
     if sys.stdout.isatty():
         raise ConfigError("an archive is not for a terminal; send it on, as in `liir backup … > run.tar.gz`")
-    back_up(run_dir, sys.stdout.buffer)
+    with written(Path("standard output")):
+        back_up(run_dir, sys.stdout.buffer)
+        sys.stdout.flush()
 
 
 @app.command()
@@ -125,7 +128,8 @@ def certs(
     from liir_common.certs import make_certs
     from liir_common.rpc.tokens import Role
 
-    make_certs(output, hosts or ())
+    with written(output):
+        make_certs(output, hosts or ())
     print(f"security: {output}/learner")
     print(
         f"# clients elsewhere have the folder of their role: {', '.join(f'{output}/{role}' for role in Role)}"

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from liir_common.errors import ConfigError
+from liir_common.errors import ConfigError, storage_explained
 
 Map = Annotated[str, typer.Option("--map", help="Battle map.")]
 Output = Annotated[Path, typer.Option("--output", "-o", help="Folder to write into.")]
@@ -30,6 +31,11 @@ def numbers(text: str) -> list[int]:
         return [int(name) for name in names(text)]
     except ValueError:
         raise ConfigError(f"wanted whole numbers separated by commas, got {text!r}") from None
+
+
+def written(output: Path) -> AbstractContextManager[None]:
+    """A block that writes to `output`; what the operating system refuses is an error with code 6."""
+    return storage_explained(output, "call this again")
 
 
 def print_result(result: dict[str, Any], as_json: bool) -> None:

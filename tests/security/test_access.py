@@ -148,6 +148,13 @@ def test_every_method_that_is_served_has_its_line_in_the_table() -> None:
     assert not set(tokens.METHODS) & tokens.PUBLIC
 
 
+@pytest.mark.parametrize("host", ["", "bad host", "learner:50051", "a..b", "https://learner"])
+def test_what_is_no_host_gets_no_certificate(tmp_path: Path, host: str) -> None:
+    with pytest.raises(ConfigError, match="wanted a host's name or IP address without a port, got"):
+        make_certs(tmp_path, [host])
+    assert not [*tmp_path.iterdir()]
+
+
 def test_a_reader_can_list_get_and_watch_and_nothing_else() -> None:
     ours = {method for method in tokens.METHODS if method.startswith("/liir.")}
     reads = {method for method in ours if re.match("List|Get|Watch", method.rpartition("/")[2])}

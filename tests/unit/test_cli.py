@@ -5,6 +5,8 @@ from __future__ import annotations
 import itertools
 import json
 import re
+import subprocess
+import sys
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -15,7 +17,7 @@ import typer
 from typer.testing import CliRunner
 
 from liir_common.cli import app
-from liir_common.errors import ConfigError
+from liir_common.errors import ConfigError, StorageError
 from liir_common.files import read_table
 from services.learner import bench
 from tests.trained import add_evaluations, make_run
@@ -152,3 +154,28 @@ def test_a_report_is_written_into_its_run_and_gathered(tmp_path: Path) -> None:
     assert len(read_table(tmp_path / "out" / "curves.csv")) == 22
     with pytest.raises(ConfigError, match="holds no run"):
         liir("report", tmp_path / "out")
+
+
+@pytest.mark.parametrize("command", ["certs", "figure", "report"])
+def test_what_cannot_be_written_is_explained(tmp_path: Path, command: str) -> None:
+    run_dir = make_run(tmp_path / "run")
+    taken = tmp_path / "taken"
+    taken.write_text("a file, where a folder is to be made")
+    arguments = {
+        "certs": ["certs"],
+        "figure": ["figure", "cosine", "--run-dir", run_dir, "--episodes", 1],
+        "report": ["report", run_dir],
+    }[command]
+    result = CliRunner().invoke(app, [*map(str, arguments), "-o", str(taken)])
+    assert isinstance(result.exception, StorageError), result.exception
+    assert re.fullmatch(f"cannot use {taken}.*: .*; mend that, then call this again", str(result.exception))
+    assert taken.is_file()
+
+
+def test_an_archive_that_finds_no_room_is_explained(tmp_path: Path) -> None:
+    run_dir = make_run(tmp_path / "run")
+    command = [sys.executable, "-m", "liir_common.cli", "backup", "--run-dir", str(run_dir)]
+    with open("/dev/full", "wb") as full:
+        result = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True)
+    assert result.stderr.startswith("error: cannot write to standard output: No space left on device; free ")
+    assert result.returncode == StorageError.exit_code

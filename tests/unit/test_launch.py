@@ -191,7 +191,7 @@ def test_one_that_left_in_peace_is_missed_only_while_the_learner_goes_on(watched
 
 def test_a_run_directory_that_is_a_file_is_explained(tmp_path: Path) -> None:
     (tmp_path / "run").touch()
-    with pytest.raises(StorageError, match=r"cannot write to .*run.*: Not a directory"):
+    with pytest.raises(StorageError, match=r"cannot use .*run.*: Not a directory"):
         LocalService("learner", [], tmp_path / "run").start()
 
 

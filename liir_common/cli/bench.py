@@ -101,3 +101,40 @@ def bench_train_command(
     from liir_common.bench import bench_train
 
     print_result(bench_train(map_name, env_steps, settings or ()), as_json)
+
+
+@bench.command("start")
+def bench_start_command(
+    map_name: Map = "3m", settings: options.Settings = None, as_json: Json = False
+) -> None:
+    """The whole service, from the command until all actors (`actors.count`) are there."""
+    from liir_common.bench import bench_start
+
+    print_result(bench_start(map_name, settings or ()), as_json)
+
+
+@bench.command("death")
+def bench_death_command(
+    map_name: Map = "3m",
+    deaths: Annotated[int, typer.Option(min=1)] = 5,
+    settings: options.Settings = None,
+    as_json: Json = False,
+) -> None:
+    """From an actor's death in a running training until the tickets that it held are played again."""
+    from liir_common.bench import bench_death
+
+    print_result(bench_death(map_name, deaths, settings or ()), as_json)
+
+
+@bench.command("resume")
+def bench_resume_command(
+    map_name: Map = "3m",
+    episodes: Annotated[int, typer.Option(min=1, help="Size of the replay, full when resumed.")] = 5000,
+    repeats: Annotated[int, typer.Option(min=1, help="How often to resume.")] = 3,
+    settings: options.Settings = None,
+    as_json: Json = False,
+) -> None:
+    """From `liir train --resume` to the first learner step, with a replay to load."""
+    from liir_common.bench import bench_resume
+
+    print_result(bench_resume(map_name, episodes, repeats, settings or ()), as_json)

@@ -85,6 +85,19 @@ def test_bench_learner_prints_what_it_documents(monkeypatch: pytest.MonkeyPatch)
             ["--env-steps", "2000", "--set", "seed=7"],
             ("8m", 2000, ["seed=7"]),
         ),
+        ("start", "liir_common.bench.bench_start", ["--set", "seed=7"], ("8m", ["seed=7"])),
+        (
+            "death",
+            "liir_common.bench.bench_death",
+            ["--deaths", "2", "--set", "seed=7"],
+            ("8m", 2, ["seed=7"]),
+        ),
+        (
+            "resume",
+            "liir_common.bench.bench_resume",
+            ["--episodes", "40", "--repeats", "2", "--set", "seed=7"],
+            ("8m", 40, 2, ["seed=7"]),
+        ),
     ],
 )
 def test_a_benchmark_gets_its_options(

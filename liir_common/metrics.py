@@ -8,27 +8,41 @@ from contextlib import contextmanager
 
 import structlog
 from prometheus_client import (
-    REGISTRY,
     CollectorRegistry,
     Counter,
     Gauge,
     Histogram,
     ProcessCollector,
+    disable_created_metrics,
     start_http_server,
 )
+from prometheus_client.metrics_core import Metric
 
 from liir_common.errors import ConfigError
 
 log = structlog.get_logger()
+
+# They are the times at which counters and histograms began, which nobody draws.
+disable_created_metrics()  # type: ignore[no-untyped-call]
+
+
+class ProcessMetrics(ProcessCollector):
+    """Of the standard metrics of a process, those that the dashboard draws."""
+
+    KEPT = ("cpu_seconds", "resident_memory_bytes", "open_fds")
+
+    def collect(self) -> Iterator[Metric]:
+        """Read them."""
+        return (family for family in super().collect() if family.name.endswith(self.KEPT))
 
 
 class ProcessRegistry(CollectorRegistry):
     """Metrics of one kind of process, and those that every process has, such as its memory."""
 
     def __init__(self) -> None:
-        """Begin with what the default registry has."""
+        """Begin without the default registry's, which anybody's library may add to."""
         super().__init__()
-        self.register(REGISTRY)
+        ProcessMetrics(registry=self)
 
     def counter(self, name: str, meaning: str, labels: Sequence[str] = ()) -> Counter:
         """A figure that only grows."""
@@ -117,7 +131,7 @@ for _reason in ("left", "timeout"):  # a rate wants the zero before the first
 @contextmanager
 def process_exposed(registry: CollectorRegistry, prefix: str, pid: int) -> Iterator[None]:
     """Expose the standard metrics of another process, too, as PREFIX_process_*."""
-    collector = ProcessCollector(prefix, lambda: pid, registry=registry)
+    collector = ProcessMetrics(prefix, lambda: pid, registry=registry)
     try:
         yield
     finally:

@@ -300,6 +300,13 @@ def build() -> dashboard.Dashboard:
                 ("rate(process_cpu_seconds_total[$__rate_interval])", "{{job}}"),
                 ("rate(compute_process_cpu_seconds_total[$__rate_interval])", "{{job}}, computing"),
             ).min(0),
+            series(
+                "Open descriptors",
+                "Files and connections, per process; level while nothing leaks.",
+                "short",
+                ("process_open_fds", "{{job}}"),
+                ("compute_process_open_fds", "{{job}}, computing"),
+            ).min(0),
         ],
     }
     for title, panels in rows.items():

@@ -112,10 +112,14 @@ def endpoints(run_dir: Path) -> dict[str, str]:
     return json.loads((run_dir / "endpoints.json").read_text())  # type: ignore[no-any-return]
 
 
+def page(url: str) -> str:
+    """What is at an address."""
+    return urllib.request.urlopen(url, timeout=30).read().decode()  # type: ignore[no-any-return]
+
+
 def samples(url: str) -> dict[str, float]:
     """Samples of a /metrics page, by name with labels."""
-    page = urllib.request.urlopen(url, timeout=30).read().decode()
-    lines = [line.rpartition(" ") for line in page.splitlines() if not line.startswith("#")]
+    lines = [line.rpartition(" ") for line in page(url).splitlines() if not line.startswith("#")]
     return {name: float(value) for name, _, value in lines}
 
 

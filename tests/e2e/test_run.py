@@ -20,6 +20,7 @@ import yaml
 
 from liir_common.replay.load import find_checkpoint
 from tests.e2e import service
+from tests.unit.test_metrics import check_described
 
 
 @pytest.fixture(scope="module")
@@ -285,6 +286,8 @@ def test_metrics_of_all_three_processes(tmp_path: Path) -> None:
             log = run_dir / "logs" / f"{name}.log"
             service.wait_for(lambda log=log, sample=sample: scrape(log).get(sample, 0) > 0, sample)  # type: ignore[misc]
         pages = {name: scrape(run_dir / "logs" / f"{name}.log") for name in LATE_SAMPLES}
+        for name in LATE_SAMPLES:
+            check_described(name, service.page(metrics_url(run_dir / "logs" / f"{name}.log")))
         process.send_signal(signal.SIGTERM)
         service.finish(process, code=128 + signal.SIGTERM)
     assert pages["learner"]['liir_env_steps_total{map="3m"}'] > 0
@@ -296,11 +299,15 @@ def test_metrics_of_all_three_processes(tmp_path: Path) -> None:
     assert pages["evaluator"]['liir_evaluation_episodes_total{actions="greedy"}'] > 0
 
 
-def scrape(log: Path) -> dict[str, float]:
-    """Samples of a process's /metrics page, which its log names; none before."""
+def metrics_url(log: Path) -> str:
+    """Of a process's /metrics page, as its log has it; empty before."""
     lines = [json.loads(line) for line in log.read_text().splitlines() if line.startswith("{")]
-    urls = (line["url"] for line in lines if line["event"] == "serving metrics")
-    url = next(urls, None)
+    return next((line["url"] for line in lines if line["event"] == "serving metrics"), "")
+
+
+def scrape(log: Path) -> dict[str, float]:
+    """Samples of a process's /metrics page; none before there is one."""
+    url = metrics_url(log)
     return service.samples(url) if url else {}
 
 

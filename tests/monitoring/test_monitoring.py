@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import shutil
 import subprocess
 import time
@@ -20,11 +21,13 @@ import yaml
 from liir_common.client import CheckpointClient
 from liir_common.errors import LiirError
 from tests.e2e import service
-from tests.unit.test_metrics import DASHBOARD, defined
+from tests.unit.test_metrics import DASHBOARD, check_described, defined
 
 pytestmark = pytest.mark.prometheus
 
 CONFIG = Path(__file__).parents[2] / "deploy/prometheus"
+OF_PROMETHEUS = re.compile("up$|scrape_|ALERTS|liir:")
+"""Series that it adds itself, of every scrape and of the rules."""
 
 
 def program(name: str) -> str:
@@ -134,7 +137,8 @@ def test_every_panel_draws_a_real_training(tmp_path: Path) -> None:
     (steps,) = (panel["targets"][0]["expr"] for panel in panels if panel["type"] == "trend")
     with service.training(run_dir, "training.total_env_steps=10000000", "learner.threads=1"):
         service.wait_for(lambda: service.learner_step(run_dir) >= 3, "the third learner step")
-        with prometheus(tmp_path, metrics_addresses(run_dir)) as url:
+        addresses = metrics_addresses(run_dir)
+        with prometheus(tmp_path, addresses) as url:
             refuse_a_call(run_dir)
             deadline = time.monotonic() + 60
             empty = set(expressions)
@@ -146,9 +150,17 @@ def test_every_panel_draws_a_real_training(tmp_path: Path) -> None:
             twice = "count by (__name__) (count by (__name__, job) ({__name__=~'liir_.*'})) > 1"
             assert ask(url, "query", query=twice)["result"] == []
             names = set(ask(url, "label/__name__/values"))
+            for job, address in addresses.items():
+                check_described(job, service.page(f"http://{address}/metrics"))
             assert ask(url, "query", query='ALERTS{alertstate="firing"}')["result"] == []
+    assert {name for name in names if not OF_PROMETHEUS.match(name)} == series()
+
+
+def series() -> set[str]:
+    """Names in Prometheus of all that is defined, and drawn."""
     histograms = {name for name, (kind, *_) in defined().items() if kind == "histogram"}
-    assert set(defined()) - histograms | {f"{name}_bucket" for name in histograms} <= names
+    parts = {f"{name}_{part}" for name in histograms for part in ("bucket", "sum", "count")}
+    return set(defined()) - histograms | parts
 
 
 def refuse_a_call(run_dir: Path) -> None:

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 import yaml
+from prometheus_client import REGISTRY, Counter, Metric, generate_latest
 from prometheus_client.metrics import MetricWrapperBase
+from prometheus_client.parser import text_string_to_metric_families
 
 from liir_common import metrics
 
@@ -17,7 +21,25 @@ ROOT = Path(__file__).parents[2]
 DASHBOARD = ROOT / "deploy/grafana/dashboards/liir.json"
 RULES = ROOT / "deploy/prometheus/rules.yml"
 NAME = re.compile(r"\b(?:liir|compute|process|python)_\w+")
-UNIT_SUFFIXES = {"seconds": "s", "bytes": "bytes", "steps": "steps", "versions": "versions"}
+UNIT_SUFFIXES = {
+    "seconds": "s",
+    "bytes": "bytes",
+    "steps": "steps",
+    "versions": "versions",
+    "fds": "descriptors",
+}
+SECTIONS = {
+    "learner": "Learner, port 9101",
+    "actors": "Actor driver, port 9102",
+    "evaluator": "Evaluator, port 9103",
+}
+"""Scrape job → heading of docs/metrics.md."""
+REGISTRIES = {"learner": metrics.LEARNER, "actors": metrics.DRIVER, "evaluator": metrics.EVALUATOR}
+
+
+def full_name(family: Metric) -> str:
+    """As its samples have it."""
+    return family.name + ("_total" if family.type == "counter" else "")
 
 
 def defined() -> dict[str, tuple[str, str, str]]:
@@ -26,17 +48,27 @@ def defined() -> dict[str, tuple[str, str, str]]:
     for metric in vars(metrics).values():
         if isinstance(metric, MetricWrapperBase):
             (family,) = metric.describe()
-            name = family.name + ("_total" if family.type == "counter" else "")
-            out[name] = (family.type, ", ".join(metric._labelnames) or "–", family.documentation)
+            out[full_name(family)] = (family.type, ", ".join(metric._labelnames) or "–", family.documentation)
+    for prefix in ("", "compute"):
+        for family in metrics.ProcessMetrics(prefix, registry=None).collect():
+            out[full_name(family)] = (family.type, "–", family.documentation)
     return out
 
 
-def documented() -> dict[str, tuple[str, str, str, str]]:
-    """Name → (type, labels, unit, meaning) of the rows of docs/metrics.md."""
-    rows = re.findall(
-        r"^\| `(\w+)` \| (\w+) \| (.*?) \| (.*?) \| (.*?) \|$", (ROOT / "docs/metrics.md").read_text(), re.M
-    )
+def documented(section: str = "") -> dict[str, tuple[str, str, str, str]]:
+    """Name → (type, labels, unit, meaning) of the rows of docs/metrics.md, or of one of its sections."""
+    text = (ROOT / "docs/metrics.md").read_text()
+    if section:
+        text = text.partition(f"\n## {section}\n")[2].partition("\n## ")[0]
+    rows = re.findall(r"^\| `(\w+)` \| (\w+) \| (.*?) \| (.*?) \| (.*?) \|$", text, re.M)
     return {name: tuple(rest) for name, *rest in rows}  # type: ignore[misc]
+
+
+def check_described(job: str, page: str) -> None:
+    """A process's /metrics page has what its section of the document has, and what every process has."""
+    families = {full_name(family): family.documentation for family in text_string_to_metric_families(page)}
+    rows = documented("Every process") | documented(SECTIONS[job])
+    assert families == {name: meaning for name, (_, _, _, meaning) in rows.items()}
 
 
 def rules() -> list[dict[str, str]]:
@@ -71,10 +103,25 @@ def test_units_are_given_and_agree_with_the_names() -> None:
 
 
 def test_every_metric_is_drawn_and_everything_drawn_exists() -> None:
-    ours = {name for name in drawn() if name.startswith("liir_")}
-    assert ours == set(defined())
-    standard = {"process_resident_memory_bytes", "process_cpu_seconds_total"}
-    assert drawn() - ours == standard | {f"compute_{name}" for name in standard}
+    assert drawn() == set(defined())
+
+
+@pytest.mark.parametrize("job", SECTIONS)
+def test_a_process_exposes_what_is_described_and_no_more(job: str) -> None:
+    counter = Counter("liir_of_a_library", "In the default registry, which is not exposed")
+    try:
+        with metrics.process_exposed(REGISTRIES["learner"], "compute", os.getpid()):
+            check_described(job, generate_latest(REGISTRIES[job]).decode())
+    finally:
+        REGISTRY.unregister(counter)
+
+
+def test_a_metric_without_a_row_is_noticed() -> None:
+    page = generate_latest(metrics.DRIVER).decode()
+    with pytest.raises(AssertionError):
+        check_described(
+            "actors", page + "# HELP process_max_fds Most.\n# TYPE process_max_fds gauge\nprocess_max_fds 1\n"
+        )
 
 
 def test_the_win_rates_of_the_trend_have_names_and_alone_end_at_one() -> None:

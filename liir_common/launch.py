@@ -64,6 +64,8 @@ class Service(ABC):
 
     phase: str = ""
     """What it said last that it was doing; only the learner is asked."""
+    silent_phase: str = "starting"
+    """Its phase if its log names none."""
 
     def __init__(self, name: str, arguments: Sequence[str], run_dir: Path, log_name: str = "") -> None:
         """Prepare `python -m services.NAME ARGUMENTS`; its log is a file in the run directory."""
@@ -98,7 +100,7 @@ class Service(ABC):
         """How it ended, its last phase and exception, and the end of its log."""
         code, words = self.exit_code or 0, self.last_words()
         how = signal.Signals(-code).name if code < 0 else meaning(code)
-        phase = self.phase or (_EVENT.findall(words) or ["starting"])[-1]
+        phase = self.phase or (_EVENT.findall(words) or [self.silent_phase])[-1]
         exception = (_EXCEPTION.findall(words) or ["none in its log"])[-1]
         lines = [line for line in words.splitlines() if line != exception][-_LAST_LINES:]
         rest = "\n".join(["ends with", *lines]) if lines else "has no more"

@@ -55,6 +55,10 @@ class RolloutActor:
         self._version = -1
         """Of the policy that this stream brought last."""
         self._refusals = 0
+        self._phase = ""
+        """What this actor waits for from the learner."""
+        self._unacknowledged = 0
+        """Trajectories handed in over this stream."""
         self._idle_since = 0.0
 
     def ready(self) -> str:
@@ -94,7 +98,13 @@ class RolloutActor:
         if refused:
             log.error("the learner refused what this actor sent", reason=error.details())
         else:
-            log.warning("the learner is away", address=self._address, reason=error.details())
+            log.warning(
+                "the learner is away",
+                address=self._address,
+                phase=self._phase,
+                unacknowledged=self._unacknowledged,
+                reason=error.details(),
+            )
 
     def _serve(self, learner: rollout_pb2_grpc.RolloutServiceStub) -> bool:
         """Play over one stream until it ends; true if the run is complete."""
@@ -112,16 +122,20 @@ class RolloutActor:
 
     def _answer(self, messages: Iterable[rollout_pb2.PlayResponse], outgoing: Outgoing) -> bool:
         self._version = -1
+        self._phase, self._unacknowledged = "connecting", 0
         self._idle_since = time.perf_counter()
         for message in messages:
+            self._phase = "waiting for tickets"  # whenever it notices that the stream broke
             if message.acks:
                 self._refusals = 0
+                self._unacknowledged -= len(message.acks)
             if message.HasField("policy"):
                 self._player.load(codec.decode_policy(message.policy, self._shapes))
                 self._version = message.policy.version
             # Not `map`, which takes a StopIteration of a game for its own end and drops the tickets left.
             for request in gather(self._play(codec.decode_ticket(ticket)) for ticket in message.tickets):
                 outgoing.put(request)
+                self._unacknowledged += len(request.trajectories)
             if message.HasField("drain"):
                 log.info("drained", reason=message.drain.reason)
                 return bool(message.drain.run_complete)

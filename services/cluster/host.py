@@ -20,6 +20,8 @@ _ANSWER_S = END_S + 10.0
 _AWAY = (ray.exceptions.RayActorError, ray.exceptions.GetTimeoutError)
 _LOST = -signal.SIGKILL
 """Exit code of a process whose node is lost."""
+_TOLD = 4096
+"""Characters of the end of its log that are known here when its node is lost."""
 
 
 class Host:
@@ -42,9 +44,9 @@ class Host:
         self._service = LocalService(self._name, [*arguments, *source, *security], self._run_dir)
         self._service.start()
 
-    def exit_code(self) -> int | None:
-        """None while it runs."""
-        return self._running().exit_code
+    def news(self) -> tuple[int | None, str]:
+        """Its exit code, None while it runs, and the end of its log."""
+        return self._running().exit_code, self._running().last_words()[-_TOLD:]
 
     def address(self) -> str | None:
         """Where it serves, once it does."""
@@ -87,8 +89,10 @@ class RemoteService(Service):
         self._config = config
         self._host: Any = None
         self._asked: Any = None
-        """Reference that resolves to the exit code, or to None if it runs at that time."""
+        """Reference that resolves to the news of it, or to None once it is started."""
         self._code: int | None = None
+        self._words = ""
+        """The end of its log when it was last heard of, and why no more is known if its node is lost."""
 
     def settle(self) -> str:
         """Have a node chosen, and stay with it whatever happens, since the run is on its disk; its address.
@@ -103,7 +107,7 @@ class RemoteService(Service):
     def start(self) -> None:
         """Start it; after its node was lost, as soon as there is a node for it."""
         self._host = self._host or self._new_host()
-        self._code = None
+        self._code, self._words, self.silent_phase = None, "", "starting"
         self._asked = self._host.start.remote(self.arguments, self._config, self.files)
 
     @property
@@ -122,13 +126,13 @@ class RemoteService(Service):
         return address
 
     def last_words(self) -> str:
-        """The end of its log."""
+        """The end of its log; of one whose node does not answer, as far as it is known here."""
         if self._host is None:
-            return "its node is lost"
+            return self._words
         try:
             return str(ray.get(self._host.last_words.remote(), timeout=_ANSWER_S))
         except _AWAY as error:
-            return f"its node does not answer: {error}"
+            return self._known("its node does not answer", error)
 
     def end(self) -> None:
         """Ask it to end, insist after a while, and bring its files here."""
@@ -157,11 +161,18 @@ class RemoteService(Service):
 
     def _answer(self) -> int | None:
         try:
-            code: int | None = ray.get(self._asked)
+            news: tuple[int | None, str] | None = ray.get(self._asked)
         except ray.exceptions.RayActorError as error:
             log.error("the node of a process is lost", service=self.name, reason=str(error))
+            self._words = self._known("its node is lost", error)
             self._host = None
             return _LOST
+        code, self._words = news or (None, "")
         if code is None:
-            self._asked = self._host.exit_code.remote()
+            self._asked = self._host.news.remote()
         return code
+
+    def _known(self, what: str, error: Exception) -> str:
+        """The last words that came, and why there are no more in one line, which an obituary wants."""
+        self.silent_phase = "unknown"  # what came may be cut short
+        return f"{self._words.rstrip()}\nerror: {what}: {' '.join(str(error).split())}\n".lstrip()

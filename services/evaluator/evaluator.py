@@ -56,6 +56,8 @@ class Evaluator:
         self._address = address
         self._config = config
         self._player = player
+        self._phase = ""
+        """What it is doing, for the log."""
 
     def run(self) -> None:
         """Return when the run is complete and every checkpoint has its test.
@@ -78,12 +80,16 @@ class Evaluator:
                 except grpc.RpcError as error:
                     if error.code() not in AWAY:
                         raise RefusedError(f"{error.code().name}: {error.details()}") from None
-                    log.warning("the learner is away", address=self._address, reason=error.details())
+                    self._log_away(error.details())
                 except UnreachableError as error:
-                    log.warning("the learner is away", address=self._address, reason=str(error))
+                    self._log_away(str(error))
                 time.sleep(next(waits))
 
+    def _log_away(self, reason: str | None) -> None:
+        log.warning("the learner is away", address=self._address, phase=self._phase, reason=reason)
+
     def _check_game(self, training: TrainingClient) -> None:
+        self._phase = "connecting"
         run = training.run()
         wanted = {"environment": run.env_spec_hash, "build": run.build}
         got = {"environment": self._player.spec.hash, "build": build()}
@@ -94,13 +100,17 @@ class Evaluator:
             )
 
     def _catch_up(self, client: CheckpointClient) -> None:
+        self._phase = "asking what is tested"
         tested = {evaluation.episode for evaluation in client.evaluations()}
+        self._phase = "waiting for checkpoints"
         for frozen in client.watch():
             if frozen.episode in tested:
                 continue
             try:
                 with metrics.EVALUATION_SECONDS.time():
-                    client.report(self._test(client, frozen))
+                    evaluation = self._test(client, frozen)
+                    self._phase = f"reporting checkpoint {frozen.episode}"
+                    client.report(evaluation)
             except MissingError as error:
                 # Only tested ones are ever deleted: another evaluator was quicker.
                 log.info("not tested", episode=frozen.episode, reason=str(error))
@@ -108,8 +118,10 @@ class Evaluator:
                 log.error("not tested", episode=frozen.episode, reason=str(error))
             else:
                 metrics.EVALUATED_EPISODE.set(frozen.episode)
+            self._phase = "waiting for checkpoints"
 
     def _test(self, client: CheckpointClient, frozen: checkpoint_pb2.Checkpoint) -> checkpoint_pb2.Evaluation:
+        self._phase = f"fetching checkpoint {frozen.episode}"
         _, tensors = client.get(frozen.episode)
         weights = checkpoint.section(tensors, "policy")
         stats = {

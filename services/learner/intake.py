@@ -141,6 +141,10 @@ class Intake:
             self._delivered = episodes.stop
             self._deliver([self._played.pop(episode) for episode in episodes])
 
+    def held(self, actor: Actor) -> int:
+        """How many tickets it has not answered, those that others have by now among them."""
+        return len(self._held[actor])
+
     def leave(self, actor: Actor) -> int:
         """The actor is gone; its unplayed tickets go to others. Returns how many."""
         if self._credits.pop(actor):

@@ -203,13 +203,15 @@ class RolloutService(rollout_pb2_grpc.RolloutServiceServicer):
         if not self._streams:
             self._empty.set()
         metrics.ACTORS.set(self.actors)
-        reissued = self._intake.leave(stream)
+        held, reissued = self._intake.held(stream), self._intake.leave(stream)
         # To gRPC here, an actor that goes and one that is lost are the same: the end of what it sends.
         reason = str(stream.error) if stream.error else "sent home" if self._drain else "gone or lost"
         log.info(
             "actor left",
             actor=stream.actor_id,
             reason=reason,
+            phase="playing" if held else "waiting for tickets",
+            tickets_held=held,
             silent_s=round(time.monotonic() - stream.heard, 1),
             tickets_to_others=reissued,
             actors=self.actors,

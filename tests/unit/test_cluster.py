@@ -5,9 +5,12 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from itertools import chain, repeat
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
+import ray
 
 from liir_common.certs import make_certs
 from liir_common.config import PLAINTEXT, SecurityConfig, load
@@ -16,6 +19,7 @@ from liir_common.launch import Request
 from liir_common.rpc import carry
 from liir_common.rpc.tokens import VARIABLE, Role, Tokens
 from services.cluster.__main__ import learners_place, roles_security
+from services.cluster.host import RemoteService
 
 HEAD = {"CPU": 4.0, "node:10.0.0.1": 1.0, "node:__internal_head__": 1.0}
 WORKER = {"CPU": 8.0, "node:10.0.0.2": 1.0}
@@ -117,3 +121,35 @@ def test_what_is_configured_is_used_by_all(tmp_path: Path) -> None:
 def test_a_file_that_cannot_be_sent_is_named() -> None:
     with pytest.raises(ConfigError, match=r"security\.ca, /nowhere/ca\.pem: No such file"):
         carry.pack(SecurityConfig(ca="/nowhere/ca.pem"))
+
+
+def lost(monkeypatch: pytest.MonkeyPatch, *logs: str) -> RemoteService:
+    """A started evaluator whose node is lost after it told these ends of its log."""
+    service = RemoteService("evaluator", [], Path("/runs/a"), {})
+    answers = [None, *((None, log) for log in logs), ray.exceptions.RayActorError()]
+    monkeypatch.setattr(service, "_new_host", Mock)
+    monkeypatch.setattr("services.cluster.host.ray.wait", lambda asked, timeout: (asked, []))
+    monkeypatch.setattr("services.cluster.host.ray.get", Mock(side_effect=chain(answers, repeat(None))))
+    service.start()
+    assert [service.exit_code for _ in answers] == [None] * (1 + len(logs)) + [-9]
+    return service
+
+
+def test_the_obituary_of_a_lost_process_has_its_last_phase_and_rays_reason(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    told = [f'{{"event": "{phase}"}}\n' for phase in ("starts", "tested")]
+    service = lost(monkeypatch, told[0], told[0] + told[1])
+    text = service.obituary()
+    assert "code -9 (SIGKILL) in the phase 'tested'; last exception: its node is lost: The actor" in text
+    assert text.endswith("evaluator.log ends with\n" + (told[0] + told[1]).rstrip())
+    service.start()
+    assert service.exit_code is None
+    assert "in the phase 'starting'" in service.obituary(), "the one before is no matter"
+
+
+@pytest.mark.parametrize("logs", [(), ("",), ("Traceback (most recent call last):\n",)])
+def test_a_lost_process_that_named_no_phase_was_in_an_unknown_one(
+    logs: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert "in the phase 'unknown'; last exception: its node is lost: " in lost(monkeypatch, *logs).obituary()

@@ -9,6 +9,7 @@ from typing import Any
 
 import grpc
 import pytest
+import structlog
 
 from liir_common.build import build
 from liir_common.config import Config
@@ -30,6 +31,7 @@ class Failing(checkpoint_pb2_grpc.CheckpointServiceServicer, training_pb2_grpc.T
 
     def __init__(self, method: str, codes: tuple[grpc.StatusCode, ...]) -> None:
         self.method, self.codes = method, list(codes)
+        self.checkpoints: tuple[int, ...] = ()
 
     def _answer(self, method: str, context: grpc.ServicerContext) -> None:
         if method == self.method and self.codes:
@@ -47,12 +49,22 @@ class Failing(checkpoint_pb2_grpc.CheckpointServiceServicer, training_pb2_grpc.T
 
     def WatchCheckpoints(self, request: Any, context: grpc.ServicerContext) -> Iterator[Any]:
         self._answer("WatchCheckpoints", context)
-        yield from ()
+        for episode in self.checkpoints:
+            yield checkpoint_pb2.WatchCheckpointsResponse(
+                checkpoint=checkpoint_pb2.Checkpoint(episode=episode)
+            )
+
+    def ReportEvaluation(
+        self, request: Any, context: grpc.ServicerContext
+    ) -> checkpoint_pb2.ReportEvaluationResponse:
+        self._answer("ReportEvaluation", context)
+        return checkpoint_pb2.ReportEvaluationResponse()
 
 
-def evaluate(method: str, *codes: grpc.StatusCode) -> int:
+def evaluate(method: str, *codes: grpc.StatusCode, checkpoints: tuple[int, ...] = ()) -> int:
     """Let an evaluator work until it ends; returns how many of the codes are left."""
     server, learner = grpc.server(futures.ThreadPoolExecutor(2)), Failing(method, codes)
+    learner.checkpoints = checkpoints
     checkpoint_pb2_grpc.add_CheckpointServiceServicer_to_server(learner, server)
     training_pb2_grpc.add_TrainingServiceServicer_to_server(learner, server)
     port = server.add_insecure_port("127.0.0.1:0")
@@ -70,6 +82,27 @@ def test_a_learner_that_is_away_is_waited_for(method: str, monkeypatch: pytest.M
     monkeypatch.setattr("services.evaluator.evaluator.backoffs", lambda: repeat(0.0))
     codes = (grpc.StatusCode.CANCELLED, grpc.StatusCode.DEADLINE_EXCEEDED, grpc.StatusCode.CANCELLED)
     assert evaluate(method, *codes) == 0
+
+
+@pytest.mark.parametrize(
+    ("method", "phase"),
+    [
+        ("GetRun", "connecting"),
+        ("ListEvaluations", "asking what is tested"),
+        ("WatchCheckpoints", "waiting for checkpoints"),
+        ("ReportEvaluation", "reporting checkpoint 100"),
+    ],
+)
+def test_what_was_being_done_when_the_learner_went_is_logged(
+    method: str, phase: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("services.evaluator.evaluator.backoffs", lambda: repeat(0.0))
+    monkeypatch.setattr(
+        Evaluator, "_test", lambda _, client, frozen: checkpoint_pb2.Evaluation(episode=frozen.episode)
+    )
+    with structlog.testing.capture_logs() as lines:
+        assert evaluate(method, grpc.StatusCode.CANCELLED, checkpoints=(100,)) == 0
+    assert [line["phase"] for line in lines if line["event"] == "the learner is away"] == [phase]
 
 
 def test_a_refusal_is_final() -> None:

@@ -9,6 +9,7 @@ from itertools import repeat
 
 import grpc
 import pytest
+import structlog
 
 from liir_common.config import Config
 from liir_common.errors import RefusedError
@@ -17,7 +18,9 @@ from services.actor.rollout_actor import RolloutActor
 
 
 class Refusing(rollout_pb2_grpc.RolloutServiceServicer):
-    """Each stream ends as the next letter says: r refused, a refused after an ack, c complete."""
+    """Each stream ends as the next letter says: r refused, a refused after an ack, u unavailable,
+    w unavailable after a policy, c complete.
+    """
 
     def __init__(self, ends: str) -> None:
         self.ends = iter(ends)
@@ -28,6 +31,10 @@ class Refusing(rollout_pb2_grpc.RolloutServiceServicer):
         end = next(self.ends)
         if end == "a":
             yield rollout_pb2.PlayResponse(acks=[rollout_pb2.Ack(episode_id=1)])
+        if end == "w":
+            yield rollout_pb2.PlayResponse(policy=rollout_pb2.Policy())
+        if end in "uw":
+            context.abort(grpc.StatusCode.UNAVAILABLE, "ends")
         if end != "c":
             context.abort(grpc.StatusCode.INVALID_ARGUMENT, "reward: wanted finite")
         yield rollout_pb2.PlayResponse(drain=rollout_pb2.Drain(run_complete=True))
@@ -60,3 +67,14 @@ def test_a_refusal_is_an_accident_and_three_in_a_row_are_a_fault(monkeypatch: py
     assert play("rrarc", monkeypatch) == "", "an ack begins the count anew"
     with pytest.raises(RefusedError, match="INVALID_ARGUMENT: reward: wanted finite"):
         play("rrrc", monkeypatch)
+
+
+def test_what_was_waited_for_when_the_learner_went_is_logged(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("services.actor.rollout_actor.codec.decode_policy", lambda *_: {})
+    monkeypatch.setattr("liir_common.rollout.fused.FusedPlayer.load", lambda *_: None)
+    monkeypatch.setattr("services.actor.rollout_actor.logs.configure", lambda _: None)
+    with structlog.testing.capture_logs() as lines:
+        assert play("uwc", monkeypatch) == ""
+    away = [line for line in lines if line["event"] == "the learner is away"]
+    assert [line["phase"] for line in away] == ["connecting", "waiting for tickets"]
+    assert [line["unacknowledged"] for line in away] == [0, 0]

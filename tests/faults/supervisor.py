@@ -20,6 +20,24 @@ _POLL_S = 0.2
 _BIN = Path(sys.executable).parent
 
 
+def alive(process: psutil.Process) -> bool:
+    """Whether there is anything of it left to kill or to stop: not of a zombie.
+
+    Raises:
+        psutil.NoSuchProcess: it is gone altogether.
+    """
+    return process.status() not in (psutil.STATUS_ZOMBIE, psutil.STATUS_DEAD)
+
+
+def kill(process: psutil.Process) -> bool:
+    """SIGKILL; false, and nothing is done, if it is dead already."""
+    with suppress(psutil.NoSuchProcess):
+        if alive(process):
+            process.kill()
+            return True
+    return False
+
+
 class Clock:
     """The wall clock of a process, which can be set."""
 
@@ -37,6 +55,14 @@ class Clock:
         """Let the clock be wrong by so many seconds from now on."""
         with self._offset.open("r+b" if self._offset.exists() else "wb") as file:
             file.write(struct.pack("q", round(seconds * 1e9)))
+
+    def rules(self, process: psutil.Process) -> bool:
+        """Whether the process reads this clock at the moment.
+
+        Raises:
+            psutil.NoSuchProcess: it is dead.
+        """
+        return any(found.path == str(self._offset) for found in process.memory_maps())
 
     @property
     def environment(self) -> dict[str, str]:
@@ -75,8 +101,7 @@ class Supervised:
     def kill(self) -> None:
         """Kill the process and all that it started: the machine is lost."""
         for process in self.tree():
-            with suppress(psutil.NoSuchProcess):
-                process.kill()
+            kill(process)
 
 
 class Supervisor:
@@ -104,8 +129,7 @@ class Supervisor:
             supervised.process.terminate()
         _, left = psutil.wait_procs(processes, timeout=15)
         for process in left:
-            with suppress(psutil.NoSuchProcess):
-                process.kill()
+            kill(process)
 
     def _watch(self) -> None:
         while self._watching:

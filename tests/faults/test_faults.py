@@ -11,8 +11,8 @@ import signal
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections import Counter
+from contextlib import suppress
 from pathlib import Path
 
 import psutil
@@ -23,7 +23,7 @@ from liir_common.errors import ComputeError, DiskFullError, UnreachableError
 from tests.e2e import service
 from tests.e2e.test_run import assert_same
 from tests.faults.proxy import Proxy
-from tests.faults.supervisor import Clock, Supervised, Supervisor, add_ray
+from tests.faults.supervisor import Clock, Supervised, Supervisor, add_ray, alive, kill
 
 pytestmark = [pytest.mark.faults, pytest.mark.timeout(1200)]
 
@@ -58,6 +58,10 @@ PLAN = {
     "skew_evaluator": 4,
 }
 """How often each fault happens; the seed shuffles them."""
+HITS = 100
+"""So many at least must have hit something."""
+TRY_S = 60.0
+"""For which a fault is tried until it does."""
 ORDINARY_CODES = {
     "learner": {-signal.SIGKILL, -signal.SIGTERM, DiskFullError.exit_code, ComputeError.exit_code},
     "evaluator": {-signal.SIGKILL, UnreachableError.exit_code},
@@ -67,14 +71,16 @@ WAITS_FOR_ROOM = "the run waits for room on its disk"
 
 
 class Faults:
-    """The service under a supervisor, and a method for everything that can go wrong with it."""
+    """The service under a supervisor, and a method for everything that can go wrong with it.
+
+    Each of them returns whether it hit anything, or raises `psutil.NoSuchProcess` if its victim is dead.
+    """
 
     def __init__(self, folder: Path, disk: Path, temporary: Path) -> None:
         """Start everything."""
         self.run_dir = disk / "run"
         self.due = 1
         """Learner step that the plan has come to"""
-        self._slowness = 0.0
         self._closed = threading.Event()
         self._disk = disk
         self._random = random.Random(SEED)
@@ -95,7 +101,7 @@ class Faults:
         take, the actors would play it to its end."""
         while not self._closed.wait(0.05):
             ahead = max(0, service.learner_step(self.run_dir) - self.due)
-            self.actors_link.delay_s = max(self._slowness, min(2.0, 0.05 * ahead))
+            self.actors_link.delay_s = min(2.0, 0.2 * ahead)
 
     def add(self, name: str, *arguments: str, folder: Path) -> None:
         environment = self._clocks[name].environment if name in self._clocks else None
@@ -115,70 +121,75 @@ class Faults:
             raise psutil.NoSuchProcess(0, "ActorProcess")
         return self._random.choice(actors)
 
-    def cut_actors(self) -> None:
-        self.actors_link.cut()
+    def cut_actors(self) -> bool:
+        return self.actors_link.cut()
 
-    def cut_evaluator(self) -> None:
-        self._evaluator_link.cut()
+    def cut_evaluator(self) -> bool:
+        return self._evaluator_link.cut()
 
-    def stall_actors(self) -> None:
+    def stall_actors(self) -> bool:
         """Sometimes longer than keepalive waits (12 s), sometimes not."""
-        self.actors_link.stall(self._random.uniform(1, 16))
+        return self.actors_link.stall(self._random.uniform(1, 16))
 
-    def stall_evaluator(self) -> None:
-        self._evaluator_link.stall(self._random.uniform(1, 16))
+    def stall_evaluator(self) -> bool:
+        return self._evaluator_link.stall(self._random.uniform(1, 16))
 
-    def delay_actors(self) -> None:
-        self._slowness = self._random.uniform(0.3, 1.0)
-        time.sleep(1)
-        self._slowness = 0.0
+    def delay_actors(self) -> bool:
+        return self.actors_link.slow(self._random.uniform(0.3, 1.0), seconds=1)
 
-    def kill_actor(self) -> None:
-        self.actor().kill()
+    def kill_actor(self) -> bool:
+        return kill(self.actor())
 
-    def pause_actor(self) -> None:
+    def pause_actor(self) -> bool:
         """Longer than a ticket may take: another plays it too, and the first hands in a second copy."""
-        with _paused(self.actor()):
-            time.sleep(5)
+        return _pause(self.actor(), 5)
 
-    def kill_evaluator(self) -> None:
-        self.process("evaluator").kill()
+    def kill_evaluator(self) -> bool:
+        return kill(self.process("evaluator"))
 
-    def kill_learner(self) -> None:
-        self.process("learner").kill()
+    def kill_learner(self) -> bool:
+        return kill(self.process("learner"))
 
-    def kill_compute(self) -> None:
-        """The process beside the learner's; the learner cannot do without."""
-        children = self.process("learner").children()
-        if not children:  # it has only begun
-            raise psutil.NoSuchProcess(0, "services.learner.compute")
-        for child in children:
-            child.kill()
+    def kill_compute(self) -> bool:
+        """The process beside the learner's, which is not there when the learner has only begun; the learner
+        cannot do without."""
+        return sum(kill(child) for child in self.process("learner").children()) > 0
 
-    def stop_learner(self) -> None:
+    def stop_learner(self) -> bool:
         """It saves, says goodbye and ends with 0, which the supervisor takes for the run's end."""
         learner = self.supervisor.services["learner"]
         process = learner.process
+        if process.poll() is not None:
+            return False
         process.terminate()
-        if process.wait(timeout=60) == 0:
+        code = process.wait(timeout=60)
+        if code == 0:
             learner.start()
+        return code in (0, -signal.SIGTERM)
 
-    def pause_learner(self) -> None:
-        with _paused(self.process("learner")):
-            time.sleep(self._random.uniform(1, 8))
+    def pause_learner(self) -> bool:
+        return _pause(self.process("learner"), self._random.uniform(1, 8))
 
-    def kill_driver(self) -> None:
-        self.process("actors").kill()
+    def kill_driver(self) -> bool:
+        return kill(self.process("actors"))
 
-    def kill_node(self) -> None:
+    def kill_node(self) -> bool:
         """A whole machine of the cluster, with its actors: the raylet goes and takes them along."""
-        self.supervisor.services[self._random.choice(("node-0", "node-1"))].kill()
+        return self._lose(self._random.choice(("node-0", "node-1")), "/raylet/raylet")
 
-    def kill_head(self) -> None:
+    def kill_head(self) -> bool:
         """The machine that knows the cluster: nodes and driver have to notice, and to join the new one."""
-        self.supervisor.services["head"].kill()
+        return self._lose("head", "/gcs/gcs_server")
 
-    def fill_disk(self) -> None:
+    def _lose(self, name: str, program: str) -> bool:
+        """Kill all of a machine on which this part of Ray runs; it may be about to start, or to end."""
+        machine = self.supervisor.services[name]
+        if not any(program in _title(process) for process in machine.tree()):
+            return False
+        machine.kill()
+        return True
+
+    def fill_disk(self) -> bool:
         """To the last byte, until the learner says so: it waits, or cannot start."""
         learner = self.supervisor.services["learner"]
         before = _complaints(learner)
@@ -188,20 +199,31 @@ class Faults:
                 pass
         service.wait_for(lambda: _complaints(learner) > before, "the learner's complaint")
         filler.unlink()
-
-    def skew_learner(self) -> None:
-        self._clocks["learner"].set(self._random.uniform(-86400, 86400))
-
-    def skew_evaluator(self) -> None:
-        self._clocks["evaluator"].set(self._random.uniform(-86400, 86400))
-
-    def happens(self, name: str) -> bool:
-        """Let it happen; false if its victim is dead at the moment."""
-        try:
-            getattr(self, name)()
-        except psutil.NoSuchProcess:
-            return False
         return True
+
+    def skew_learner(self) -> bool:
+        return self._skew("learner")
+
+    def skew_evaluator(self) -> bool:
+        return self._skew("evaluator")
+
+    def _skew(self, name: str) -> bool:
+        clock = self._clocks[name]
+        if not clock.rules(self.process(name)):
+            return False
+        clock.set(self._random.uniform(-86400, 86400))
+        return True
+
+    def hits(self, name: str, number: int) -> bool:
+        """Let the plan's fault of that number happen as soon as there is anything that it can hit."""
+        deadline = time.monotonic() + TRY_S
+        while time.monotonic() < deadline:
+            self._random.seed(SEED + number)  # however often it and those before were tried
+            with suppress(psutil.NoSuchProcess):
+                if getattr(self, name)():
+                    return True
+            time.sleep(0.05)
+        return False
 
     def close(self) -> None:
         """End everything."""
@@ -222,14 +244,17 @@ def _title(process: psutil.Process) -> str:
     return ""
 
 
-@contextmanager
-def _paused(process: psutil.Process) -> Iterator[None]:
+def _pause(process: psutil.Process, seconds: float) -> bool:
+    """Stop it for a while, and return then; false if it is dead or stopped already."""
+    if not alive(process) or process.status() == psutil.STATUS_STOPPED:
+        return False
     process.suspend()
     try:
-        yield
+        time.sleep(seconds)
     finally:
         with suppress(psutil.NoSuchProcess):
             process.resume()
+    return True
 
 
 def plan() -> list[str]:
@@ -238,20 +263,27 @@ def plan() -> list[str]:
     return faults
 
 
-def inject(faults: Faults, learner_steps: int) -> None:
-    """Let everything happen while the run goes on, evenly over three quarters of its learner steps."""
-    names = plan()
-    assert len(names) >= 100
+def inject(faults: Faults, learner_steps: int) -> Counter[str]:
+    """Let everything happen while the run goes on, evenly over three quarters of its learner steps.
+
+    Returns how often each fault hit something.
+    """
+    names, hits = plan(), Counter[str]()
     for number, name in enumerate(names):
         faults.due = due = 1 + learner_steps * 3 * number // (4 * len(names))
         service.wait_for(lambda due=due: service.learner_step(faults.run_dir) >= due, f"learner step {due}")
-        print(f"{time.monotonic():.1f} s, learner step {service.learner_step(faults.run_dir)}: {name}")
-        service.wait_for(lambda name=name: faults.happens(name), name)
+        begin, hit = time.monotonic(), faults.hits(name, number)
+        hits[name] += hit
+        print(
+            f"{begin:.1f} s, learner step {service.learner_step(faults.run_dir)}: {name} "
+            f"{'hit' if hit else 'missed'} after {time.monotonic() - begin:.1f} s"
+        )
     faults.due = learner_steps
+    return hits
 
 
 def test_a_hundred_faults_change_nothing(
-    tmp_path: Path, small_disk: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, small_disk: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for name, value in yaml.safe_load(COMPOSE.read_text())["x-ray"]["environment"].items():
         monkeypatch.setenv(name, str(value))  # Ray's nodes and the driver go by it
@@ -264,7 +296,7 @@ def test_a_hundred_faults_change_nothing(
         services = faults.supervisor.services
         try:
             service.wait_for(lambda: service.learner_step(faults.run_dir) > 0, "the first learner step")
-            inject(faults, steps)
+            hits = inject(faults, steps)
             assert service.learner_step(faults.run_dir) < steps, "the run was over before the faults were"
             service.wait_for(lambda: services["learner"].process.poll() == 0, "the run's end", 300)
         finally:
@@ -273,3 +305,7 @@ def test_a_hundred_faults_change_nothing(
     for name, codes in ORDINARY_CODES.items():
         assert set(services[name].codes) <= codes, services[name].log.read_text()[-5000:]
     assert WAITS_FOR_ROOM in services["learner"].log.read_text()
+    with capsys.disabled():
+        print(f"\n{hits.total()} of {len(plan())} faults hit:", *(f"{name} {hits[name]}" for name in PLAN))
+    assert hits.total() >= HITS
+    assert all(hits[name] for name in PLAN)

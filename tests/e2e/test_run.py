@@ -317,11 +317,16 @@ def test_learner_away_at_start_is_a_clear_error() -> None:
         assert "no learner answered at 127.0.0.1:9" in service.finish(process, code=3)
 
 
-def test_a_launcher_that_is_killed_leaves_no_process(tmp_path: Path) -> None:
+def test_a_launcher_that_is_killed_leaves_no_process_and_loses_nothing(
+    undisturbed: Path, tmp_path: Path
+) -> None:
     run_dir = tmp_path / "run"
-    with service.training(run_dir, "training.total_env_steps=1000000") as process:
-        service.wait_for(lambda: service.learner_step(run_dir) >= 2, "the second learner step")
+    with service.training(run_dir) as process:
+        service.wait_for(lambda: service.learner_step(run_dir) >= 5, "the fifth learner step")
         children = psutil.Process(process.pid).children(recursive=True)
         os.kill(process.pid, signal.SIGKILL)
         _, left = psutil.wait_procs(children, timeout=30)
         assert not left
+    assert_under_way(run_dir, undisturbed)
+    service.train(run_dir, options=["--resume"])
+    assert_same(run_dir, undisturbed)

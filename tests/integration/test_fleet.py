@@ -12,7 +12,6 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import psutil
-import pytest
 import ray
 import structlog
 from ray.cluster_utils import Cluster
@@ -20,9 +19,9 @@ from ray.cluster_utils import Cluster
 from services.actor.driver import Fleet
 from tests.e2e import service
 from tests.faults.supervisor import Supervisor, add_ray
+from tests.integration.conftest import NODE
 
 ACTORS = 4
-NODE = {"num_cpus": 2, "object_store_memory": 80 * 2**20}
 DRIVER = """
 import sys
 from liir_common import config
@@ -34,19 +33,6 @@ assert fleet._start_due()
 print("waits", flush=True)
 fleet.run()
 """
-
-
-@pytest.fixture
-def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Cluster]:
-    """A head that plays nothing; nodes come later."""
-    monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
-    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "object_store_memory": 80 * 2**20})
-    ray.init(address=cluster.address, namespace="liir")
-    try:
-        yield cluster
-    finally:
-        ray.shutdown()
-        cluster.shutdown()
 
 
 def crowds(fleet: Fleet) -> list[int]:

@@ -237,6 +237,34 @@ def test_a_learner_on_a_machine_with_a_gpu_that_is_lost_and_back(cluster: Cluste
     cluster.ray(f"down --yes {CLUSTER}")
 
 
+def test_a_head_that_is_lost_and_back(cluster: Cluster, tmp_path: Path) -> None:
+    """Launcher, driver and learner are on it: the run ends everywhere, and goes on from its last save."""
+    cluster.ray(f"up --yes {CLUSTER}")
+    run_dir, output = cluster.head.home / RUN, tmp_path / "submit.log"
+    submitted = cluster.submit(output, "--config configs/3m.yaml --set training.save_interval=5")
+    wait_for(lambda: learner_step(run_dir) > 10, "learner steps", 600)
+    wait_for(lambda: actors(cluster) == (ACTORS // 2, ACTORS // 2), "actors on both machines")
+    cluster.head.lose()
+    assert submitted.wait(120) != 0
+    wait_for(lambda: processes(cluster.worker, "ray::") == 0, "the end of all that was on the worker")
+    lost_at = learner_step(run_dir)
+    kept = CheckpointStore(str(run_dir / "checkpoints")).manifests
+
+    cluster.head.boot(SSHD, cluster.user)
+    cluster.ray(f"up --yes {CLUSTER}")
+    more = int(read_table(run_dir / "metrics.csv")[-1]["env_steps"]) + 2000
+    submitted = cluster.submit(output, "--resume", f"--set training.total_env_steps={more}")
+    assert submitted.wait(600) == 0, output.read_text(errors="replace")[-3000:]
+    steps = [int(row["learner_step"]) for row in read_table(run_dir / "metrics.csv")]
+    assert steps == list(range(1, len(steps) + 1))
+    assert len(steps) > lost_at
+    manifests = CheckpointStore(str(run_dir / "checkpoints")).manifests
+    assert manifests[: len(kept)] == kept != []
+    tested = [int(row["episode"]) for row in read_table(run_dir / "evaluations.csv")]
+    assert tested == [manifest.episode for manifest in manifests]
+    cluster.ray(f"down --yes {CLUSTER}")
+
+
 def actors(cluster: Cluster) -> tuple[int, int]:
     """How many rollout actors there are on the head and on the worker."""
     return processes(cluster.head, "ray::ActorProcess"), processes(cluster.worker, "ray::ActorProcess")

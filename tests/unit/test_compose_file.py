@@ -38,6 +38,16 @@ def test_nothing_permits_plaintext_and_ports_are_on_loopback() -> None:
     assert all(port.startswith(("127.0.0.1:", "${LEARNER_ADDRESS:-127.0.0.1}:")) for port in published)
 
 
+def test_who_watches_is_needed_by_nobody_and_keeps_its_data() -> None:
+    watchers = {"prometheus": "/prometheus", "grafana": "/var/lib/grafana"}
+    for name, service in services().items():
+        if name not in watchers:
+            assert not watchers.keys() & service.get("depends_on", {}).keys()
+    for name, folder in watchers.items():
+        assert services()[name]["restart"] == "unless-stopped"
+        assert f"{name}:{folder}" in services()[name]["volumes"]
+
+
 def test_grafana_finds_its_dashboard_and_the_dashboard_its_data() -> None:
     grafana = services()["grafana"]
     mounted = {at: ROOT / folder for folder, at, *_ in (line.split(":") for line in grafana["volumes"])}

@@ -34,6 +34,8 @@ LEARNER_ADDRESS = "127.0.0.2"
 LEARNER = f"{LEARNER_ADDRESS}:{LEARNER_PORT}"
 WORKERS, ACTORS = 3, 6
 EPISODE = 80
+# Exit code of a container that did not end within its grace period, too.
+SIGKILLED = 137
 DOCUMENT = ROOT / "docs/operations.md"
 SETTINGS = {
     "LIIR_ACTORS__COUNT": ACTORS,
@@ -124,9 +126,23 @@ class Compose:
         lines = self("run", "--rm", "certs", "sh", "-c", command).splitlines()
         return {line.split()[-1] for line in lines if "-----" not in line}
 
-    def up(self) -> None:
+    def up(self, workers: int = WORKERS) -> None:
         """Start everything and wait until it is healthy."""
-        self("up", "--detach", "--wait", "--wait-timeout", "600", "--scale", f"ray-worker={WORKERS}")
+        self("up", "--detach", "--wait", "--wait-timeout", "600", "--scale", f"ray-worker={workers}")
+
+    def drop_worker(self) -> int:
+        """One worker less; returns the exit code of its container, which is removed."""
+        labels = ("com.docker.compose.project=liir-test", "com.docker.compose.service=ray-worker")
+        filters = [f"--filter={key}" for key in ("event=die", *(f"label={label}" for label in labels))]
+        command = ["docker", "events", f"--since={time.time():.0f}", *filters]
+        command += ["--format", "{{.Actor.Attributes.exitCode}}"]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as events:
+            try:
+                self.up(WORKERS - 1)
+                assert events.stdout
+                return int(events.stdout.readline())
+            finally:
+                events.terminate()
 
     def run_to(self, env_steps: int) -> None:
         """Give the run so many environment steps in all."""
@@ -234,6 +250,16 @@ def test_up_deaths_rotations_down_and_up_again(compose: Compose) -> None:
     wait_for(lambda: compose.status().learner_step > before + 5, "learner steps with new tokens")
     wait_for(lambda: query("liir_actors_connected") == ACTORS, "all actors connected with new tokens")
 
+    # A worker less: it ends within its grace period, although actors live on it, and they go elsewhere.
+    wait_for(
+        lambda: all(compose.processes("ray-worker", "ray::ActorProcess", n + 1) for n in range(WORKERS)),
+        "actors on every worker",
+    )
+    assert compose.drop_worker() != SIGKILLED
+    before = compose.status().learner_step
+    wait_for(lambda: compose.status().learner_step > before + 5, "learner steps with one worker less")
+    wait_for(lambda: query("liir_actors_connected") == ACTORS, "all actors connected with one worker less")
+
     # A copy is made while the run goes on. A stop is graceful; nor did a secret reach a log or a container's
     # description.
     copied = compose.status()
@@ -243,6 +269,8 @@ def test_up_deaths_rotations_down_and_up_again(compose: Compose) -> None:
     exit_codes = {container["Service"]: container["ExitCode"] for container in containers}
     ended = ("certs", "learner", "actors", "evaluator")
     assert [exit_codes[service] for service in ended] == [0, 0, 0, 0], exit_codes
+    killed = [container["Name"] for container in containers if container["ExitCode"] == SIGKILLED]
+    assert not killed
     shown = compose("logs") + compose.run(["docker", "inspect", *(c["ID"] for c in containers)])
     secrets |= compose.secrets()
     assert len(secrets) > 30

@@ -8,9 +8,11 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import yaml
+from ray._private import ray_constants
 
 ROOT = Path(__file__).parents[2]
 ROLES = {"learner": "learner", "ray-worker": "actor", "actors": "actor", "evaluator": "evaluator"}
+DRAIN = "RAY_GRACEFUL_SHUTDOWN_DRAIN_TIMEOUT_S"
 
 
 def services() -> dict[str, Any]:
@@ -29,6 +31,12 @@ def test_a_service_mounts_the_folder_of_its_role_to_read() -> None:
         name: [f"certs-{role}:/certs:ro"] for name, role in ROLES.items()
     }
     assert set(made[1:]) == {f"certs-{role}:/certs/{role}" for role in ROLES.values()}
+
+
+def test_a_ray_node_does_not_wait_for_its_actors_when_it_is_to_end() -> None:
+    assert hasattr(ray_constants, DRAIN), "Ray calls it something else now"
+    nodes = [service for service in services().values() if "ray start" in service.get("command", "")]
+    assert [service["environment"][DRAIN] for service in nodes] == [0, 0, 0]
 
 
 def test_nothing_permits_plaintext_and_ports_are_on_loopback() -> None:

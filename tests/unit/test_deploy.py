@@ -172,5 +172,12 @@ def test_every_pod_can_write_where_the_run_is(job: dict[str, Any]) -> None:
         assert run_folder[1] in [mount["mountPath"] for mount in container["volumeMounts"]]
 
 
+def test_no_pod_waits_for_its_actors_when_it_is_to_end(job: dict[str, Any]) -> None:
+    cluster = job["spec"]["rayClusterSpec"]
+    for group in (cluster["headGroupSpec"], *cluster["workerGroupSpecs"]):
+        (container,) = group["template"]["spec"]["containers"]
+        assert {"name": "RAY_GRACEFUL_SHUTDOWN_DRAIN_TIMEOUT_S", "value": "0"} in container["env"]
+
+
 def test_kubernetes_runs_the_ray_that_is_installed(job: dict[str, Any]) -> None:
     assert job["spec"]["rayClusterSpec"]["rayVersion"] == ray.__version__

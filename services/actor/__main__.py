@@ -25,7 +25,7 @@ def actors(
         # Compiled once here; every actor finds the result in the cache.
         warm_up(resolved.env)
         start_ray(resolved.actors)
-        # From now on this container is healthy, and the evaluator, which wants the kernels, may start.
+        # From now on this container is healthy, and the evaluator may start, which compiles as much.
         metrics.serve(
             metrics.DRIVER, resolved.metrics.host, resolved.actors.metrics_port, "actors.metrics_port"
         )

@@ -33,6 +33,16 @@ def test_a_service_mounts_the_folder_of_its_role_to_read() -> None:
     assert set(made[1:]) == {f"certs-{role}:/certs/{role}" for role in ROLES.values()}
 
 
+def test_compiled_code_is_shared_within_a_role_only() -> None:
+    mounted = {
+        name: [volume for volume in service.get("volumes", ()) if volume.endswith(":/kernels")]
+        for name, service in services().items()
+    }
+    assert {name: volumes for name, volumes in mounted.items() if volumes} == {
+        name: [f"kernels-{role}:/kernels"] for name, role in (ROLES | {"ray-head": "actor"}).items()
+    }
+
+
 def test_a_ray_node_does_not_wait_for_its_actors_when_it_is_to_end() -> None:
     assert hasattr(ray_constants, DRAIN), "Ray calls it something else now"
     nodes = [service for service in services().values() if "ray start" in service.get("command", "")]

@@ -49,6 +49,10 @@ def test_a_ray_node_does_not_wait_for_its_actors_when_it_is_to_end() -> None:
     assert [service["environment"][DRAIN] for service in nodes] == [0, 0, 0]
 
 
+def test_what_runs_on_has_a_health_check() -> None:
+    assert [name for name, service in services().items() if "healthcheck" not in service] == ["certs"]
+
+
 def test_nothing_permits_plaintext_and_ports_are_on_loopback() -> None:
     assert "insecure" not in (ROOT / "docker-compose.yml").read_text().lower()
     published = [str(port) for service in services().values() for port in service.get("ports", ())]

@@ -132,15 +132,22 @@ class Compose:
 
     def drop_worker(self) -> int:
         """One worker less; returns the exit code of its container, which is removed."""
-        labels = ("com.docker.compose.project=liir-test", "com.docker.compose.service=ray-worker")
-        filters = [f"--filter={key}" for key in ("event=die", *(f"label={label}" for label in labels))]
-        command = ["docker", "events", f"--since={time.time():.0f}", *filters]
-        command += ["--format", "{{.Actor.Attributes.exitCode}}"]
+        workers = set(self("ps", "--quiet", "ray-worker").split())
+        label = "label=com.docker.compose.project=liir-test"
+        command = [
+            "docker",
+            "events",
+            f"--since={time.time():.0f}",
+            "--filter=event=die",
+            f"--filter={label}",
+        ]
+        command += ["--format", "{{.ID}} {{.Actor.Attributes.exitCode}}"]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as events:
             try:
                 self.up(WORKERS - 1)
-                assert events.stdout
-                return int(events.stdout.readline())
+                (removed,) = workers - set(self("ps", "--quiet", "ray-worker").split())
+                deaths = (line.split() for line in events.stdout or ())
+                return next(int(code) for container, code in deaths if container == removed)
             finally:
                 events.terminate()
 

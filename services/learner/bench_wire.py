@@ -61,6 +61,7 @@ class _Intake:
     async def policy_arrived(self, begin: float) -> None:
         """Wait until every stream has got a policy since `begin`."""
         while min(self.arrivals) < begin:
+            _check(self.clients)
             await asyncio.sleep(_POLL_S)
 
     def allow(self) -> None:
@@ -86,34 +87,51 @@ async def _intake(settings: config.Config, streams: int, tickets: int) -> AsyncI
     await server.start()
     # Played here: every client would load the compiled code, or compile it.
     episode = _episode(settings).SerializeToString()
-    with ExitStack() as stack:
-        file = stack.enter_context(tempfile.TemporaryFile())
-        file.truncate(8 * streams)
-        clients = []
-        for index in range(streams):
-            arguments = [f"127.0.0.1:{server.port}", spec.hash, tickets, len(episode), file.fileno(), index]
-            client = stack.enter_context(_client(arguments, file.fileno()))
-            stack.callback(client.terminate)
-            clients.append(client)
-        try:
+    try:
+        # The clients end first, who else would speak of a server that has gone.
+        with ExitStack() as stack:
+            file = stack.enter_context(tempfile.TemporaryFile())
+            file.truncate(8 * streams)
+            clients = []
+            for index in range(streams):
+                arguments = [
+                    f"127.0.0.1:{server.port}",
+                    spec.hash,
+                    tickets,
+                    len(episode),
+                    file.fileno(),
+                    index,
+                ]
+                client = stack.enter_context(_client(arguments, file.fileno()))
+                stack.callback(client.terminate)
+                clients.append(client)
             # In a thread, as they read it once they have started: gRPC cancels calls that wait half a minute
             # for a loop that stands still.
             await asyncio.to_thread(_write, clients, episode)
             while service.actors < streams:
-                if any(client.poll() for client in clients):
-                    raise RuntimeError("a client died before all had joined; its error is above")
+                _check(clients)
                 await asyncio.sleep(0.1)
             weights = random_weights(spec, settings.algorithm.policy_hidden, seed=0)
             arrivals = memoryview(mmap.mmap(file.fileno(), 0)).cast("d")
             yield _Intake(service, delivered, weights, clients, arrivals, len(episode))
             await service.drain("measured", run_complete=True, grace_s=5.0)
-        finally:
-            await server.stop(0)
+    finally:
+        await server.stop(0)
 
 
 def _client(arguments: Sequence[object], arrivals_fd: int) -> subprocess.Popen[bytes]:
     command = [sys.executable, "-m", bench_client.__name__, *map(str, arguments)]
     return subprocess.Popen(command, stdin=subprocess.PIPE, bufsize=0, pass_fds=[arrivals_fd])
+
+
+def _check(clients: Sequence[subprocess.Popen[bytes]]) -> None:
+    """See that all live.
+
+    Raises:
+        RuntimeError: one does not.
+    """
+    if any(client.poll() is not None for client in clients):
+        raise RuntimeError("a client died; its error is above")
 
 
 def _write(clients: Sequence[subprocess.Popen[bytes]], data: bytes) -> None:

@@ -29,8 +29,8 @@ def join(frames: Sequence[bytes]) -> dict[str, Array]:
 def split(arrays: Mapping[str, Array]) -> list[bytes]:
     """The frames that were joined."""
     stops = arrays["sizes"].cumsum()
-    data = arrays["frames"].tobytes()
-    return [data[stop - size : stop] for stop, size in zip(stops, arrays["sizes"], strict=True)]
+    data = arrays["frames"].data
+    return [bytes(data[stop - size : stop]) for stop, size in zip(stops, arrays["sizes"], strict=True)]
 
 
 class ReplayStore:

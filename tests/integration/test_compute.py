@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from dataclasses import replace
 
 import numpy as np
@@ -122,6 +123,23 @@ def test_signals_are_for_the_learner_and_what_kills_it_is_told(monkeypatch: pyte
             compute.state()
         with pytest.raises(ComputeError, match="SIGKILL killed it before 'policy'"):
             compute.policy()
+
+
+def test_a_process_that_dies_while_it_computes_is_told() -> None:
+    """Once it has taken the batch, so that nothing that was sent is left unread."""
+    with Compute(SPEC, settings("algorithm.policy_epochs=100000")) as compute:
+        killer = threading.Thread(target=kill_when_it_computes, args=[compute.pid])
+        killer.start()
+        with pytest.raises(ComputeError, match="SIGKILL killed it during 'update'"):
+            compute.update(batch_of(0))
+        killer.join()
+
+
+def kill_when_it_computes(pid: int) -> None:
+    process = psutil.Process(pid)
+    before = process.cpu_times().user
+    wait_for(lambda: process.cpu_times().user > before + 0.5, "an update that computes")
+    process.kill()
 
 
 def test_nothing_that_json_cannot_say_is_sent() -> None:

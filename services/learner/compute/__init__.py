@@ -27,7 +27,7 @@ from services.learner.replay_store import join, split
 _COMMAND = (sys.executable, "-m", __name__)
 _END_S = 10.0
 _ERRORS = {kind.__name__: kind for kind in (ConfigError, FloatingPointError, ValueError)}
-"""What an algorithm is expected to raise; anything else is a RuntimeError here."""
+"""What an algorithm is expected to raise."""
 
 
 class Answer(StrEnum):
@@ -35,7 +35,7 @@ class Answer(StrEnum):
 
     VALUE = "value"
     ERROR = "error"
-    """What was raised: its class, its text, and its traceback, which would stay behind"""
+    """What was raised: its classes, its text, and its traceback, which would stay behind"""
     POLICY = "policy"
     """The update goes on, this is the policy that it leaves"""
 
@@ -43,7 +43,8 @@ class Answer(StrEnum):
 class Compute:
     """An `Algorithm` in a process of its own.
 
-    What is raised there is raised here, and `ComputeError` by every method once that process is gone.
+    What is raised there is raised here, as the first of its classes that `Algorithm` speaks of, else as a
+    RuntimeError; and `ComputeError` by every method once that process is gone.
     """
 
     def __init__(self, spec: EnvSpec, config: Config) -> None:
@@ -121,6 +122,7 @@ class Compute:
             self._link.send([what, value], arrays)
         except OSError:
             raise self._death(f"before {what!r}") from None
+        del arrays  # which may be a whole replay
         while True:
             try:
                 (answer, got), got_arrays = self._link.receive()
@@ -169,8 +171,8 @@ class _Replay:
         self._ask("replay.restore", total, join(frames))
 
 
-def _error(kind: str, text: str, trace: str) -> Exception:
-    known = _ERRORS.get(kind)
-    error = RuntimeError(f"{kind}: {text}") if known is None else known(text)
+def _error(kinds: list[str], text: str, trace: str) -> Exception:
+    known = next((_ERRORS[kind] for kind in kinds if kind in _ERRORS), None)
+    error = RuntimeError(f"{kinds[0]}: {text}") if known is None else known(text)
     error.add_note(f"There:\n{trace}")
     return error

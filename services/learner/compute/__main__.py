@@ -33,8 +33,7 @@ def main(make: Make) -> None:
     with closing(Link(end)) as link, suppress(EOFError, ConnectionError):
         worker = Worker(link, make)
         while True:
-            (what, value), arrays = link.receive()
-            worker.answer(what, value, arrays)
+            worker.answer(*link.receive())  # nothing of which stays here while the next is waited for
 
 
 class Worker:
@@ -46,15 +45,16 @@ class Worker:
         self._make = make
         self._algorithm: Algorithm
 
-    def answer(self, what: str, value: Any, arrays: Mapping[str, Array]) -> None:
+    def answer(self, question: tuple[str, Any], arrays: Mapping[str, Array]) -> None:
         """Do it, and send what came of it."""
         try:
-            got, got_arrays = self._do(what, value, arrays)
-        except Exception as error:
-            raised = [type(error).__name__, str(error), traceback.format_exc()]
-            self._link.send([Answer.ERROR, raised])
-        else:
+            got, got_arrays = self._do(*question, arrays)
             self._link.send([Answer.VALUE, got], got_arrays)
+        except ConnectionError:  # the other end is gone
+            raise
+        except Exception as error:
+            kinds = [kind.__name__ for kind in type(error).__mro__]
+            self._link.send([Answer.ERROR, [kinds, str(error), traceback.format_exc()]])
 
     def _do(self, what: str, value: Any, arrays: Mapping[str, Array]) -> tuple[Any, Mapping[str, Array]]:
         if what == "make":

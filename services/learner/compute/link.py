@@ -6,6 +6,7 @@ import json
 import socket
 import struct
 from collections.abc import Mapping
+from contextlib import suppress
 from types import MappingProxyType
 from typing import Any
 
@@ -27,7 +28,9 @@ class Link:
         self._file = end.makefile("rb")
 
     def close(self) -> None:
-        """Tell the other end that this one is gone."""
+        """Tell the other end that this one is gone, and a thread that waits in `receive` here."""
+        with suppress(OSError):  # the other end is gone already
+            self._socket.shutdown(socket.SHUT_RDWR)
         self._file.close()
         self._socket.close()
 
@@ -38,12 +41,13 @@ class Link:
             OSError: the other end is gone.
         """
         text = json.dumps(head).encode()
+        # safetensors reads the memory as if every array were in one piece.
         body = save({name: np.asarray(array, order="C") for name, array in arrays.items()})
         self._socket.sendall(_SIZES.pack(len(text), len(body)) + text)
         self._socket.sendall(body)
 
     def receive(self) -> tuple[Any, dict[str, Array]]:
-        """Wait for the next message.
+        """Wait for the next message; its arrays come in no particular order.
 
         Raises:
             EOFError: the other end is gone.

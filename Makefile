@@ -10,7 +10,8 @@ help: ## Show this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 18
 
 # Stamped, so that set-up costs nothing once the pinned requirements are in.
-$(VENV)/.installed: requirements.txt requirements-torch.txt requirements-torch-cpu.txt requirements-dev.txt pyproject.toml
+$(VENV)/.installed: requirements.txt requirements-torch.txt requirements-torch-cpu.txt requirements-dev.txt pyproject.toml \
+		deploy/install-torch.sh
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --require-hashes -r requirements.txt
 	deploy/install-torch.sh $(BIN)/pip
@@ -76,7 +77,7 @@ requirements: setup ## Pin what pyproject.toml asks for, with hashes (ARGS="--up
 	$(PIN_REST) --group dev -c requirements.txt -o requirements-dev.txt
 	for image in actor learner node; do $(PIN_REST) pyproject.toml --group build --extra $$image -c requirements.txt \
 		-o deploy/requirements-$$image.txt || exit; done
-	$(PIN_REST) --group aws -o deploy/requirements-aws.txt
+	for group in uv aws; do $(PIN_REST) --group $$group -c requirements.txt -o deploy/requirements-$$group.txt || exit; done
 	# Not as pyproject.toml says that torch is: with what the usual build needs.
 	$(PIN) --no-config -c requirements.txt requirements-torch.in -o requirements-torch.txt
 

@@ -5,7 +5,12 @@ set -eu
 pip=$1
 folder=$(dirname "$0")/..
 cpu=$(sed -n 's/^torch==\([^ ]*\).*/\1/p' "$folder/requirements-torch-cpu.txt")
-if "$pip" index versions torch 2>/dev/null | sed -n '/^Available/p' | grep -qwF "$cpu"
+if ! offered=$(env -u PIP_QUIET "$pip" index versions torch 2>&1)
+then
+  echo "$offered" >&2
+  exit 1
+fi
+if echo "$offered" | sed -n '/^Available/p' | grep -qwF "$cpu"
 then "$pip" install --quiet --require-hashes --no-deps -r "$folder/requirements-torch-cpu.txt"
 else "$pip" install --quiet --require-hashes -r "$folder/requirements-torch.txt"
 fi

@@ -127,7 +127,7 @@ def test_both_clusters_set_up_the_same() -> None:
     for key in ("rsync_exclude", "worker_start_ray_commands"):
         assert ours[key] == aws[key]
     only_there = aws["file_mounts"].items() - ours["file_mounts"].items()
-    assert [here for _, here in only_there] == ["deploy/requirements-aws.txt"]
+    assert {here for _, here in only_there} == {"deploy/requirements-aws.txt", "deploy/requirements-uv.txt"}
     assert ours["file_mounts"].items() < aws["file_mounts"].items()
     assert ours["setup_commands"][1:] == aws["setup_commands"][1:]
 

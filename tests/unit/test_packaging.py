@@ -111,33 +111,45 @@ print(sum(1 for _ in Policy.load({str(path)!r}).play(parallel_env("3m"), seed=1)
 def test_every_pinned_requirement_has_a_hash_and_no_file_names_a_registry() -> None:
     files = sorted([*ROOT.glob("requirements*.txt"), *ROOT.glob("deploy/requirements*.txt")])
     versions = set(re.findall("^torch==.*", (ROOT / "requirements-torch.in").read_text(), flags=re.M))
-    assert len(files) == 8
+    assert len(files) == 9
+    pinned: dict[str, set[str]] = {}
     for path in files:
         text = path.read_text()
         pins = re.split(r"^(?=[a-z])", text, flags=re.M)[1:]
         assert pins
         assert all("==" in pin and "--hash=sha256:" in pin for pin in pins)
         assert "://" not in text
+        for pin in pins:
+            pinned.setdefault(pin.partition("==")[0], set()).add(pin.split()[0].removesuffix("+cpu"))
         torch = {pin.split()[0].removesuffix("+cpu") for pin in pins if pin.startswith("torch==")}
         assert torch == (versions if "torch" in path.name else set()), "one version, in files of its own"
+    several = {name for name, pins in pinned.items() if len(pins) > 1}
+    assert not several, "what is installed together was not pinned together"
 
 
-def test_nothing_is_installed_without_a_hash_but_ourselves() -> None:
-    files = ("Makefile", "deploy/Dockerfile", "deploy/cluster.yaml", "deploy/cluster.aws.yaml", TORCH)
-    texts = [(ROOT / name).read_text() for name in files]
+@pytest.mark.parametrize(
+    "name", ["Makefile", "deploy/Dockerfile", "deploy/cluster.yaml", "deploy/cluster.aws.yaml", TORCH]
+)
+def test_nothing_is_installed_without_a_hash_but_ourselves(name: str) -> None:
+    lines = (ROOT / name).read_text().splitlines()
     commands = [
-        command for text in texts for command in re.findall(r'pip"? (?:install|wheel) [^&|;)\n]*', text)
+        c for line in lines for c in re.findall(r'pip\d?"?\s.*?(?:install|wheel|download) [^&|;)]*', line)
     ]
-    assert len(commands) == 19
-    assert not [command for command in commands if not re.search("--require-hashes|--no-deps", command)]
+    assert commands
+    ours = re.compile(r"--no-deps.* (-e \.|\.|/wheel/\*\.whl|~/liir-service)\s*$")
+    assert not [
+        c for c in commands if "--require-hashes" not in c and not ours.search(c) and "apt-get" not in c
+    ]
 
 
 @pytest.mark.parametrize(
     ("build", "refusal"),
     [("+cpu", "DO NOT MATCH THE HASHES"), ("", "No matching distribution found for cuda-bindings==")],
 )
-def test_a_torch_that_nobody_pinned_is_refused(tmp_path: Path, build: str, refusal: str) -> None:
-    """With CUDA's libraries or without depends on what pip is offered, not on what is installed."""
+def test_torch_is_pinned_with_or_without_cuda_as_it_is_offered(
+    tmp_path: Path, build: str, refusal: str
+) -> None:
+    """Not as it is installed; and one that nobody pinned, as that which is offered here, is refused."""
     (version,) = re.findall("^torch==(.*)", (ROOT / "requirements-torch.in").read_text(), flags=re.M)
     wheel, info = f"torch-{version}{build}", f"torch-{version}{build}.dist-info"
     with zipfile.ZipFile(tmp_path / f"{wheel}-py3-none-any.whl", "w") as archive:

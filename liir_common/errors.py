@@ -46,7 +46,7 @@ class RefusedError(LiirError):
 
 
 class StorageError(LiirError):
-    """The run directory, or what a command was to write, cannot be written to."""
+    """A run directory, or other output, cannot be written to."""
 
     exit_code = 6
 

@@ -62,7 +62,7 @@ def test_a_run_stopped_on_a_full_disk_ends_with_code_six_and_is_resumed(
             service.wait_for(lambda: waits_for_room(run_dir), "the run's waiting")
             process.send_signal(signal.SIGTERM)
             output = service.finish(process, code=6)
-            assert "code 6 (The run directory cannot be written to)" in output
+            assert "code 6 (A run directory, or other output, cannot be written to)" in output
             assert "No space left on device" in service.finish(
                 service.start("learner", "--resume", "--run-dir", str(run_dir), "--set", "learner.port=0"),
                 code=6,

@@ -51,7 +51,10 @@ class Program(LocalService):
         ("{}[7]", ["code 1 (an error that is not foreseen)", "'tested'", "last exception: KeyError: 7;"]),
         (
             "with exit_on_error():\n    raise StorageError('no room')",
-            ["code 6 (The run directory cannot be written to)", "last exception: no room;"],
+            [
+                "code 6 (A run directory, or other output, cannot be written to)",
+                "last exception: no room;",
+            ],
         ),
         (
             "os.kill(os.getpid(), signal.SIGKILL)",

@@ -5,16 +5,16 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 
-from liir_common import checkpoint, config, files, launch, metrics
+from liir_common import config, files, launch, metrics
 from liir_common.build import git_commit
 from liir_common.checkpoint import CheckpointStore, pack, section, unpack
 from liir_common.errors import CorruptError, DivergedError
 from liir_common.types import Batch, Weights
-from services.learner import run_directory
 from services.learner.algorithms import make_algorithm
 from services.learner.intake import Opening
 from services.learner.run_directory import RunDirectory
@@ -201,17 +201,15 @@ class Writes:
         """Watch every way to a file that a learner step has; the first write is number 0."""
         self.count = 0
         self._dies_before = dies_before
-        write_atomic = self._watched(files.write_atomic)
-        for module in (files, checkpoint, run_directory):
-            monkeypatch.setattr(module, "write_atomic", write_atomic)
-        monkeypatch.setattr(files, "_append_whole", self._watched(files._append_whole))
+        for name in ("_replaced", "_append_whole"):
+            monkeypatch.setattr(files, name, self._watched(getattr(files, name)))
 
-    def _watched(self, write: Callable[[Path, bytes], None]) -> Callable[[Path, bytes], None]:
-        def watched(path: Path, data: bytes) -> None:
+    def _watched(self, write: Callable[..., Any]) -> Callable[..., Any]:
+        def watched(*arguments: Any, **options: Any) -> Any:
             if self.count == self._dies_before:
                 raise Died
             self.count += 1
-            write(path, data)
+            return write(*arguments, **options)
 
         return watched
 
@@ -264,9 +262,9 @@ def test_a_run_without_all_its_checkpoints_is_not_resumed_unless_told_to(tmp_pat
         path.unlink()
     with pytest.raises(CorruptError, match="1 checkpoints, from 8 on, are missing") as caught:
         Played(tmp_path, 4, *settings)
-    advice = re.search(r"empty file (\S+)", str(caught.value))
+    advice = re.search(r"append a line (\S+) to (\S+)", str(caught.value))
     assert advice
-    (tmp_path / "checkpoints" / advice[1]).touch()
+    Path(advice[2]).write_text(advice[1])
     assert list(Played(tmp_path, 4, *settings).train().digests()) == [4, 12, 16]
 
 

@@ -183,7 +183,8 @@ def test_of_a_deleted_checkpoint_a_number_is_in_memory(
             store.delete(episode)
 
     come_and_go(range(200))
-    assert bytes_left(lambda: come_and_go(range(200, 1200))) / 1000 < 24
+    # So many that what else is kept, such as freed objects for the next ones, is little beside it.
+    assert bytes_left(lambda: come_and_go(range(200, 4200))) / 4000 < 24
 
 
 @pytest.mark.parametrize("left", [9, 4 + 64], ids=["in the digest", "before the end of the line"])

@@ -206,6 +206,8 @@ def test_tickets_of_a_broken_stream_go_to_the_next_actor(learner: tuple[str, Pat
     with Actor(address) as actor:
         actor.ask(2)
         assert actor.order().episode_id == 0
+    with TrainingClient(address) as training:
+        service.wait_for(lambda: training.status().actors == 0, "the end of the stream at the learner")
     with Actor(address) as actor:
         actor.ask(1)
         assert actor.order().episode_id == 0

@@ -8,7 +8,7 @@ it.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -51,25 +51,29 @@ class ReplayStore:
             name = f"replay-{first:09d}-{first + len(frames):09d}.safetensors"
             write_digested(self._path / name, save(join(frames)))
 
-    def load(self, first: int, stop: int) -> list[bytes]:
-        """The episodes `first` … `stop` - 1; later ones, which no state knows, are removed.
+    def load(self, first: int, stop: int) -> Iterator[tuple[int, list[bytes]]]:
+        """The episodes `first` … `stop` - 1 file by file, each with its first number.
+
+        Later ones, which no state knows, are removed.
 
         Raises:
             CorruptError: some are missing or cannot be read.
         """
-        frames: dict[int, bytes] = {}
+        known = []
         for start, end, path in self._files():
             if start >= stop:
                 path.unlink()
             elif end > first:
-                frames |= enumerate(_read(path), start)
-        missing = [episode for episode in range(first, stop) if episode not in frames]
+                known.append((start, end, path))
+        missing = set(range(first, stop)).difference(*(range(start, end) for start, end, _ in known))
         if missing:
             raise CorruptError(
-                f"{len(missing)} episodes of the replay, from {missing[0]} on, are missing under "
+                f"{len(missing)} episodes of the replay, from {min(missing)} on, are missing under "
                 f"{self._path}; restore them from a backup, or remove all states to train from the start"
             )
-        return [frames[episode] for episode in range(first, stop)]
+        for start, end, path in known:
+            yield first, _read(path)[first - start : stop - start]
+            first = end
 
     def prune(self, before: int) -> None:
         """Remove the files that have no episode from number `before` on."""

@@ -271,7 +271,8 @@ class Trainer:
     def _restore_replay(self, total: int) -> None:
         if self.algorithm.replay is not None:
             first = max(0, total - self.config.algorithm.replay.episodes)
-            self.algorithm.replay.restore(total, self.run_directory.replay.load(first, total))
+            for start, frames in self.run_directory.replay.load(first, total):
+                self.algorithm.replay.extend(start, frames)
 
     def _restore(self) -> None:
         saved = self.run_directory.load_state()

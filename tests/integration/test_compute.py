@@ -77,7 +77,7 @@ def test_it_learns_the_same_bits(method: list[str]) -> None:
             assert there.replay.first == here.replay.first == 4
             assert there.replay.frames(10) == here.replay.frames(10)
             frames = there.replay.frames(4)
-            there.replay.restore(30, frames)
+            there.replay.extend(10, frames)
             assert (there.replay.first, there.replay.frames(10)) == (10, frames)
         state = here.state()
         there.update(batch_of(7))

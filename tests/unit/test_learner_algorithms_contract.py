@@ -55,7 +55,7 @@ def copy(source: Algorithm, into: Algorithm) -> None:
     """What the learner does when it resumes."""
     into.load_state(source.state())
     if source.replay is not None:
-        into.replay.restore(source.replay.total, source.replay.frames(source.replay.first))
+        into.replay.extend(source.replay.first, source.replay.frames(source.replay.first))
 
 
 def assert_equal_states(a: Algorithm, b: Algorithm, *, but_for: str = "nothing") -> None:

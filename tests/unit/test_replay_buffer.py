@@ -24,6 +24,16 @@ def batch_of(first: int) -> Batch:
     return Batch.from_trajectories(episodes, epsilon=0.3)
 
 
+def loaded(store: ReplayStore, first: int, stop: int) -> list[bytes]:
+    """What comes of it, each part from where the one before ended."""
+    at, frames = first, []
+    for start, part in store.load(first, stop):
+        assert start == at
+        frames += part
+        at += len(part)
+    return frames
+
+
 def test_a_sample_has_every_bit_of_the_episodes() -> None:
     replay = Replay(SPEC, capacity=10)
     replay.add(batch_of(0))
@@ -59,19 +69,29 @@ def test_restored_from_disk_it_is_the_same(tmp_path: Path) -> None:
         "replay-000000008-000000012",
     ]
     other = Replay(SPEC, capacity=6)
-    other.restore(12, ReplayStore(tmp_path).load(6, 12))
+    for first, frames in ReplayStore(tmp_path).load(6, 12):
+        other.extend(first, frames)
     assert (other.first, other.total) == (6, 12)
     assert other.frames(6) == replay.frames(6)
+
+
+def test_episodes_that_do_not_come_next_take_the_place_of_all() -> None:
+    replay = Replay(SPEC, capacity=6)
+    replay.extend(3, [b"x", b"y"])
+    replay.extend(5, [b"z"])
+    assert (replay.first, replay.total, replay.frames(3)) == (3, 6, [b"x", b"y", b"z"])
+    replay.extend(1, [b"a"])
+    assert (replay.first, replay.total, replay.frames(1)) == (1, 2, [b"a"])
 
 
 def test_episodes_that_no_state_knows_are_forgotten(tmp_path: Path) -> None:
     store = ReplayStore(tmp_path)
     store.append(0, [b"a", b"bb"])
     store.append(2, [b"later"])
-    assert ReplayStore(tmp_path).load(0, 2) == [b"a", b"bb"]
+    assert loaded(ReplayStore(tmp_path), 0, 2) == [b"a", b"bb"]
     assert store.stop == 2
     store.append(2, [b"again"])
-    assert ReplayStore(tmp_path).load(1, 3) == [b"bb", b"again"]
+    assert loaded(ReplayStore(tmp_path), 1, 3) == [b"bb", b"again"]
 
 
 def test_pruning_keeps_what_is_still_wanted(tmp_path: Path) -> None:
@@ -79,7 +99,7 @@ def test_pruning_keeps_what_is_still_wanted(tmp_path: Path) -> None:
     for first in (0, 2, 4):
         store.append(first, [b"x", b"y"])
     store.prune(3)
-    assert store.load(3, 6) == [b"y", b"x", b"y"]
+    assert loaded(store, 3, 6) == [b"y", b"x", b"y"]
     assert len(list(tmp_path.iterdir())) == 2
 
 
@@ -88,7 +108,7 @@ def test_a_file_that_was_written_before_there_were_digests_is_read(tmp_path: Pat
     store.append(0, [b"x", b"y"])
     (path,) = tmp_path.iterdir()
     path.rename(tmp_path / "replay-000000000-000000002.safetensors")
-    assert store.load(0, 2) == [b"x", b"y"]
+    assert loaded(store, 0, 2) == [b"x", b"y"]
 
 
 @pytest.mark.parametrize("damage", [lambda data: data[:-1], lambda data: data[:-1] + b"{"])
@@ -99,8 +119,8 @@ def test_a_missing_or_damaged_file_is_an_error_that_says_so(
     store.append(0, [b"x", b"y"])
     store.append(4, [b"z"])
     with pytest.raises(CorruptError, match="2 episodes of the replay, from 2 on, are missing"):
-        store.load(0, 5)
+        loaded(store, 0, 5)
     (path,) = tmp_path.glob("replay-000000004-*")
     path.write_bytes(damage(path.read_bytes()))
     with pytest.raises(CorruptError, match=r"replay-000000004.* cannot be read"):
-        store.load(4, 5)
+        loaded(store, 4, 5)

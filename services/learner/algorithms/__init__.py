@@ -28,8 +28,8 @@ class SavedReplay(Protocol):
     def frames(self, first: int) -> list[bytes]:
         """The episodes from number `first` on."""
 
-    def restore(self, total: int, frames: Sequence[bytes]) -> None:
-        """Hold `frames`, the newest of `total` episodes."""
+    def extend(self, first: int, frames: Sequence[bytes]) -> None:
+        """Take in the episodes from number `first` on; unless they come next, nothing else stays."""
 
 
 class Algorithm(Protocol):

@@ -53,11 +53,12 @@ class Replay:
         """The episodes from number `first` on, which has to be here or to come next."""
         return [self._frames[index] for index in range(first - self.first, len(self._frames))]
 
-    def restore(self, total: int, frames: Sequence[bytes]) -> None:
-        """Hold `frames`, the newest of `total` episodes."""
-        self._frames.clear()
+    def extend(self, first: int, frames: Sequence[bytes]) -> None:
+        """Take in the episodes from number `first` on; unless they come next, nothing else stays."""
+        if first != self.total:
+            self._frames.clear()
         self._frames.extend(frames)
-        self.total = total
+        self.total = first + len(frames)
 
     def _unpack(self, index: int) -> Trajectory:
         data = zstandard.ZstdDecompressor().decompress(self._frames[index])

@@ -166,9 +166,9 @@ class _Replay:
         """As `Replay.frames`."""
         return split(self._ask("replay.frames", first)[1])
 
-    def restore(self, total: int, frames: Sequence[bytes]) -> None:
-        """As `Replay.restore`."""
-        self._ask("replay.restore", total, join(frames))
+    def extend(self, first: int, frames: Sequence[bytes]) -> None:
+        """As `Replay.extend`."""
+        self._ask("replay.extend", first, join(frames))
 
 
 def _error(kinds: list[str], text: str, trace: str) -> Exception:

@@ -79,8 +79,8 @@ class Worker:
                 return self._replay.first, NO_ARRAYS
             case "replay.frames":
                 return None, join(self._replay.frames(value))
-            case "replay.restore":
-                self._replay.restore(value, split(arrays))
+            case "replay.extend":
+                self._replay.extend(value, split(arrays))
                 return None, NO_ARRAYS
         raise NotImplementedError(what)
 

@@ -244,6 +244,24 @@ def test_up_deaths_rotations_down_and_up_again(compose: Compose) -> None:
     wait_for(lambda: compose.restarts("learner") > 0, "the learner started again")
     wait_for(lambda: compose.status().learner_step > before + 5, "learner steps after its death")
 
+    # All others but Grafana die at once: each is started again, and the run goes on.
+    dying = {
+        "ray-head": "gcs_server",
+        "actors": "/venv/bin/liir actors",
+        "evaluator": "/venv/bin/liir evaluator",
+    }
+    seen = compose.status()
+    for service, command in dying.items():
+        compose.kill(service, command)
+    # As the first process of its container it ignores SIGKILL from inside.
+    compose("exec", "prometheus", "sh", "-c", "kill -ABRT 1")
+    wait_for(lambda: all(map(compose.restarts, (*dying, "prometheus"))), "all of them started again")
+    wait_for(lambda: query("sum(up)") == 4, "four targets up again")
+    wait_for(lambda: query("liir_actors_connected") == ACTORS, "all actors connected to the next head")
+    wait_for(lambda: compose.status().learner_step > seen.learner_step + 5, "learner steps")
+    wait_for(lambda: compose.status().evaluations > seen.evaluations, "an evaluation")
+    assert query("count(min_over_time(liir_learner_step[1h]) < 5)") == 1, "what it saw before it died"
+
     # New certificates are served at once, new tokens lock out whoever has the old ones; the run goes on.
     certificate, secrets = served_certificate(), compose.secrets()
     compose.documented("Renew the certificates")

@@ -64,12 +64,13 @@ def _readings(found: Sequence[Life]) -> dict[str, list[tuple[Values, Values]]]:
     """The pairs of vectors (health, r_in) by reading."""
     made = [(life.health[at], life.taken[at]) for life in found for at in [~np.isnan(life.taken)]]
     able = [(life.health, life.possible) for life in found]
+    centred = [_centred(*pair) for pair in [_joined(made)] if len(pair[0])]
     return {
         "attacks made, per life": made,
         "attacks made, all in one vector": [_joined(made)],
         "attacks possible, per life": able,
         "attacks possible, all in one vector": [_joined(able)],
-        "attacks made, all in one vector, centred": [_centred(*_joined(made))],
+        "attacks made, all in one vector, centred": centred,
     }
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import faulthandler
 import os
+import secrets
 import time
 from collections import Counter
 from collections.abc import Mapping
@@ -13,6 +14,7 @@ from typing import Any
 
 import ray
 import structlog
+from ray._private import ray_constants
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from liir_common import metrics
@@ -195,13 +197,17 @@ def start_ray(config: ActorsConfig) -> None:
         LiirError: the cluster cannot be reached.
     """
     faulthandler.dump_traceback_later(_RAY_START_S, exit=True)
-    # Ray decides by itself when this is unset, and writes a token into the home folder.
-    os.environ.setdefault("RAY_AUTH_MODE", "disabled")
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     try:
         if config.ray_address:
+            # When this is unset, Ray decides by what it finds in the home folder.
+            os.environ.setdefault("RAY_AUTH_MODE", "disabled")
             ray.init(address=config.ray_address, namespace="liir")
         else:
+            # Whoever reaches Ray has it run code. By itself it would take a token from the home folder, and
+            # listen on all addresses; only this constant, False on macOS, keeps it to loopback.
+            os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex())
+            ray_constants.ENABLE_RAY_CLUSTER = False
             # Trajectories go over gRPC, so the object store can be as small as Ray allows.
             ray.init(address="local", include_dashboard=False, object_store_memory=80 * 2**20)
     except (ConnectionError, RuntimeError, ValueError) as error:

@@ -299,6 +299,25 @@ def test_metrics_of_all_three_processes(tmp_path: Path) -> None:
     assert pages["evaluator"]['liir_evaluation_episodes_total{actions="greedy"}'] > 0
 
 
+def test_nothing_is_open_to_other_machines_or_users(tmp_path: Path) -> None:
+    run_dir = tmp_path / "run"
+    with service.training(run_dir, "training.total_env_steps=1000000") as process:
+        service.wait_for(lambda: service.learner_step(run_dir) >= 3, "the third learner step")
+        below = psutil.Process(process.pid).children(recursive=True)
+        listening = [
+            (child.name(), connection.laddr.ip.removeprefix("::ffff:"))
+            for child in below
+            for connection in child.net_connections()
+            if connection.status == psutil.CONN_LISTEN
+        ]
+        (raylet,) = service.descendants(process, "raylet/raylet")
+        token = raylet.environ()["RAY_AUTH_TOKEN"], raylet.environ()["RAY_AUTH_MODE"]
+    assert {"gcs_server", "raylet"} < {name for name, _ in listening}
+    assert {address for _, address in listening} == {"127.0.0.1"}
+    # On loopback there are other users, who are not to have Ray run code in this one's name.
+    assert (len(token[0]), token[1]) == (64, "token")
+
+
 def metrics_url(log: Path) -> str:
     """Of a process's /metrics page, as its log has it; empty before."""
     lines = [json.loads(line) for line in log.read_text().splitlines() if line.startswith("{")]

@@ -34,7 +34,7 @@ ENVIRONMENT = {
     "HOME": str(Path.home()),
     "USER": "root",
     "PATH": f"{VENV}/bin:/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin",
-    "RAY_AUTH_MODE": "disabled",
+    "RAY_AUTH_MODE": "token",
     "RAY_USAGE_STATS_ENABLED": "0",
 }
 SSHD = "/usr/sbin/sshd -o PermitRootLogin=yes -o PasswordAuthentication=no -o UsePAM=no -o MaxStartups=100"

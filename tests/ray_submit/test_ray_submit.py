@@ -57,6 +57,7 @@ class Cluster:
         for machine in (self.head, self.worker):
             (machine.home / "liir-venv").symlink_to(VENV)
             machine.boot(SSHD, self.user)
+        self.ray("get-auth-token --generate")
 
     def end(self) -> None:
         """All three off."""
@@ -166,6 +167,11 @@ def test_up_submit_a_worker_lost_and_back_finish_down(cluster: Cluster, tmp_path
     assert processes(cluster.head, "ray::Host") + processes(cluster.worker, "ray::Host") == 2
     wait_for(lambda: actors(cluster) == (ACTORS // 2, ACTORS // 2), "actors on both machines")
     wait_for(lambda: (run_dir / "evaluations.csv").exists(), "the first evaluation")
+
+    # From outside nobody has Ray do anything without the token that `ray up` brought here.
+    status = f"ray status --address={cluster.head.address}:6379"
+    assert "Active" in cluster.worker.run(f"RAY_AUTH_MODE=token {status}")
+    assert "InvalidAuthToken" in cluster.worker.run(f"RAY_AUTH_MODE=disabled {status} 2>&1 || true")
 
     # The worker is lost: the head plays on alone. It is back: Ray sets it up again, actors move there.
     cluster.worker.lose()

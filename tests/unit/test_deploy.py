@@ -115,7 +115,8 @@ def test_the_schema_finds_what_ray_does_not_know() -> None:
 @pytest.mark.parametrize("name", CLUSTERS)
 def test_what_a_cluster_file_sends_and_runs_exists(name: str) -> None:
     cluster = read(name)
-    for there, here in cluster["file_mounts"].items():
+    sent = cluster["file_mounts"] | {"~/.ray/auth_token": "deploy"}  # the user makes that
+    for there, here in sent.items():
         assert (DEPLOY.parent / here).exists(), f"{there}: {here}"
     for key, commands in cluster.items():
         for command in commands if key.endswith("_commands") else ():
@@ -129,7 +130,8 @@ def test_both_clusters_set_up_the_same() -> None:
     only_there = aws["file_mounts"].items() - ours["file_mounts"].items()
     assert {here for _, here in only_there} == {"deploy/requirements-aws.txt", "deploy/requirements-uv.txt"}
     assert ours["file_mounts"].items() < aws["file_mounts"].items()
-    assert ours["setup_commands"][1:] == aws["setup_commands"][1:]
+    assert ours["setup_commands"][0] == aws["setup_commands"][0]
+    assert ours["setup_commands"][2:] == aws["setup_commands"][2:]
 
 
 def test_the_aws_head_and_counts_are_consistent() -> None:

@@ -30,6 +30,111 @@ def test_preset_fills_what_is_not_written() -> None:
     assert strong.env.options["reward_only_positive"] is True
 
 
+def optimizers(name: str) -> dict[str, object]:
+    """All three have one rate and one clip; the eps of the others would freeze η."""
+    common = {"name": name, "lr": 5e-4, "eps": 1e-5, "alpha": 0.99, "clip": 10.0}
+    return {"policy_optimizer": common, "critic_optimizer": common, "eta_optimizer": common | {"eps": 1e-10}}
+
+
+BOTH: dict[str, object] = {
+    "lambda": 0.01,
+    "freeze_eta": False,
+    "gamma": 0.99,
+    "limit_is_terminal": True,
+    "r_in_gain": 0.1,
+    "policy_hidden": 64,
+}
+STRONG = (
+    BOTH
+    | optimizers("adam")
+    | {
+        "gae_lambda": 0.95,
+        "target_interval": 0,
+        "normalize_advantages": True,
+        "normalize_values": True,
+        "policy_epochs": 4,
+        "ratio_clip": 0.2,
+        "critic_epochs": 4,
+        "entropy": 0.03,
+        "orthogonal_init": True,
+        "policy_gain": 3.0,
+        "exploration": {"start": 0.5, "end": 0.05, "steps": 300_000},
+        "r_in_bound": 1.0,
+    }
+)
+PAPER = (
+    BOTH
+    | optimizers("rmsprop")
+    | {
+        "gae_lambda": 0.8,
+        "target_interval": 200,
+        "normalize_advantages": False,
+        "normalize_values": False,
+        "policy_epochs": 1,
+        "critic_epochs": 1,
+        "entropy": 0.0,
+        "orthogonal_init": False,
+        "exploration": {"start": 0.5, "end": 0.01, "steps": 50_000},
+        "r_in_bound": 10.0,
+    }
+)
+
+
+@pytest.mark.parametrize("method", ["liir", "central_v", "iac"])
+@pytest.mark.parametrize(
+    ("preset", "positive", "values"), [("strong", True, STRONG), ("paper", False, PAPER)]
+)
+def test_presets_are_what_the_documentation_says(
+    method: str, preset: str, positive: bool, values: dict[str, object]
+) -> None:
+    """The table in docs/algorithm.md, with what `paper` changes of the authors' release."""
+    tree = config.load(None, [f"preset={preset}", f"algorithm={method}"]).tree()
+    assert {key: tree["algorithm"][key] for key in values} == values
+    assert tree["env"]["options"] == {"reward_only_positive": positive, "state_last_action": False}
+
+
+def test_without_a_preset_liir_is_strong() -> None:
+    none = config.load(None, ["preset=none"])
+    assert none.algorithm == config.load(None, ["preset=strong"]).algorithm
+    assert none.env.options == {}
+
+
+PYMARL: dict[str, object] = {
+    "normalize_advantages": False,
+    "normalize_values": False,
+    "policy_epochs": 1,
+    "entropy": 0.0,
+    "orthogonal_init": False,
+    "policy_optimizer": optimizers("rmsprop")["policy_optimizer"],
+}
+COMA = PYMARL | {
+    "gae_lambda": 0.8,
+    "critic_epochs": 8,
+    "target_interval": 25,
+    "critic_optimizer": optimizers("rmsprop")["critic_optimizer"],
+    "exploration": {"start": 0.5, "end": 0.01, "steps": 100_000},
+}
+OF_VALUES = PYMARL | {
+    "gae_lambda": 0.0,
+    "target_interval": 6,
+    "exploration": {"start": 1.0, "end": 0.05, "steps": 50_000},
+    "replay": {"episodes": 5000, "batch_episodes": 32, "episodes_per_update": 8},
+    "mixer_width": 32,
+    "hypernet_width": 64,
+}
+
+
+@pytest.mark.parametrize("preset", ["strong", "paper"])
+@pytest.mark.parametrize(
+    ("method", "values"), [("coma", COMA), ("iql", OF_VALUES), ("vdn", OF_VALUES), ("qmix", OF_VALUES)]
+)
+def test_other_methods_have_pymarls_values_with_either_preset(
+    preset: str, method: str, values: dict[str, object]
+) -> None:
+    tree = config.load(None, [f"preset={preset}", f"algorithm={method}"]).tree()["algorithm"]
+    assert {key: tree[key] for key in values} == values
+
+
 def test_algorithm_may_be_its_name(tmp_path: Path) -> None:
     assert config.load(None, ["algorithm=central_v"]).algorithm.name == "central_v"
     file = tmp_path / "run.yaml"

@@ -2,6 +2,7 @@
 
     ca.pem, ca-key.pem                       stay where they were made
     ROLE/ca.pem, cert.pem, key.pem, tokens   all that a machine of the role needs: `security: FOLDER/ROLE`
+    actor/ray-token                          of Ray's nodes among themselves: RAY_AUTH_TOKEN_PATH
 
 The roles are `learner`, which has everybody's tokens, and those of `Role`, which have their own.
 """
@@ -43,8 +44,8 @@ _TOKEN_BYTES = 32
 def make_certs(folder: Path, hosts: Sequence[str] = ()) -> None:
     """Write the CA and every role's folder; again, renew all certificates and hand out the tokens anew.
 
-    A CA and the learner's tokens that are there already are kept. The learner's certificate holds for this
-    machine's loopback names and for `hosts`, names or IP addresses.
+    A CA, the learner's tokens and Ray's that are there already are kept. The learner's certificate holds for
+    this machine's loopback names and for `hosts`, names or IP addresses.
 
     Raises:
         ConfigError: the CA or the learner's tokens in `folder` cannot be used, or a host is none.
@@ -59,6 +60,9 @@ def make_certs(folder: Path, hosts: Sequence[str] = ()) -> None:
     for role in Role:
         _issue(folder / role, ca, ca_key, [ExtendedKeyUsageOID.CLIENT_AUTH], [])
     _hand_out_tokens(folder)
+    ray_token = folder / Role.ACTOR / "ray-token"
+    if not ray_token.exists():
+        write_atomic(ray_token, secrets.token_hex(_TOKEN_BYTES).encode(), _PRIVATE)
 
 
 def _hand_out_tokens(folder: Path) -> None:

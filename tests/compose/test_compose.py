@@ -122,7 +122,7 @@ class Compose:
 
     def secrets(self) -> set[str]:
         """Every token, and every line of every private key."""
-        command = "cat /certs/*/tokens /certs/*/key.pem /certs/ca-key.pem"
+        command = "cat /certs/*/tokens /certs/*/key.pem /certs/ca-key.pem /certs/actor/ray-token"
         lines = self("run", "--rm", "certs", "sh", "-c", command).splitlines()
         return {line.split()[-1] for line in lines if "-----" not in line}
 
@@ -227,6 +227,10 @@ def test_up_deaths_rotations_down_and_up_again(compose: Compose) -> None:
     # A service has the token of its role, and from outside it takes TLS and one, too.
     for service, role in {"ray-worker": "actor", "actors": "actor", "evaluator": "evaluator"}.items():
         assert re.fullmatch(rf"{role} \S+\n", compose("exec", service, "cat", "/certs/tokens"))
+    status = "ray status --address=ray-head:6379 2>&1 || true"
+    assert "Active" in compose("exec", "ray-worker", "sh", "-c", status)
+    stranger = ("exec", "--env", "RAY_AUTH_MODE=disabled", "ray-worker")
+    assert "InvalidAuthToken" in compose(*stranger, "sh", "-c", status)
     assert "no learner answered" in compose.run([LIIR, "status", "--learner", LEARNER], code=3)
     compose.documented("Fetch a checkpoint")
     first = compose.fetched()

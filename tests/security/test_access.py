@@ -331,8 +331,18 @@ def test_metrics_are_served_on_loopback_unless_asked() -> None:
 
 def test_private_files_are_private(certs: Path) -> None:
     for file in filter(Path.is_file, certs.rglob("*")):
-        private = file.name in ("tokens", "key.pem", "ca-key.pem")
+        private = file.name in ("tokens", "ray-token", "key.pem", "ca-key.pem")
         assert file.stat().st_mode & 0o777 == (0o600 if private else 0o644), file
+
+
+def test_rays_token_is_kept_until_it_is_removed(tmp_path: Path) -> None:
+    make_certs(tmp_path)
+    assert len(token := (tmp_path / "actor" / "ray-token").read_text()) == 64
+    make_certs(tmp_path)
+    assert (tmp_path / "actor" / "ray-token").read_text() == token
+    (tmp_path / "actor" / "ray-token").unlink()
+    make_certs(tmp_path)
+    assert (tmp_path / "actor" / "ray-token").read_text() != token
 
 
 def test_a_role_is_handed_its_own_tokens(tmp_path: Path) -> None:

@@ -11,7 +11,13 @@ import yaml
 from ray._private import ray_constants
 
 ROOT = Path(__file__).parents[2]
-ROLES = {"learner": "learner", "ray-worker": "actor", "actors": "actor", "evaluator": "evaluator"}
+ROLES = {
+    "learner": "learner",
+    "ray-head": "actor",
+    "ray-worker": "actor",
+    "actors": "actor",
+    "evaluator": "evaluator",
+}
 DRAIN = "RAY_GRACEFUL_SHUTDOWN_DRAIN_TIMEOUT_S"
 
 
@@ -39,7 +45,7 @@ def test_compiled_code_is_shared_within_a_role_only() -> None:
         for name, service in services().items()
     }
     assert {name: volumes for name, volumes in mounted.items() if volumes} == {
-        name: [f"kernels-{role}:/kernels"] for name, role in (ROLES | {"ray-head": "actor"}).items()
+        name: [f"kernels-{role}:/kernels"] for name, role in ROLES.items()
     }
 
 
@@ -47,6 +53,12 @@ def test_a_ray_node_does_not_wait_for_its_actors_when_it_is_to_end() -> None:
     assert hasattr(ray_constants, DRAIN), "Ray calls it something else now"
     nodes = [service for service in services().values() if "ray start" in service.get("command", "")]
     assert [service["environment"][DRAIN] for service in nodes] == [0, 0, 0]
+
+
+def test_every_ray_node_has_the_token_of_the_others() -> None:
+    nodes = [service for service in services().values() if "ray start" in service.get("command", "")]
+    wanted = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN_PATH": "/certs/ray-token"}
+    assert [wanted.items() <= service["environment"].items() for service in nodes] == [True] * 3
 
 
 def test_what_runs_on_has_a_health_check() -> None:

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import re
 import shutil
 import socket
 import ssl
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -34,8 +37,9 @@ from liir_common.rpc.gen.liir.v1 import (
 )
 from liir_common.rpc.server import Server
 from liir_common.rpc.tokens import Role
-from tests.grpcurl import grpcurl, needs_grpcurl
+from tests.grpcurl import needs_grpcurl
 
+ROOT = Path(__file__).parents[2]
 DENIED, UNKNOWN = grpc.StatusCode.PERMISSION_DENIED, grpc.StatusCode.UNAUTHENTICATED
 REACHED = "Method not implemented!"
 """What the generated servicers say when a call has come through; no test here needs more than that."""
@@ -162,21 +166,31 @@ def test_a_reader_can_list_get_and_watch_and_nothing_else() -> None:
     assert len(reads) == 6
 
 
+def shell(commands: str, folder: Path) -> str:
+    """All that documented commands print in a folder."""
+    done = subprocess.run(
+        ["sh", "-c", commands],
+        cwd=folder,
+        env={"PATH": os.pathsep.join((str(Path(sys.executable).parent), os.environ["PATH"]))},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        timeout=60,
+    )
+    return done.stdout
+
+
 @needs_grpcurl
-def test_grpcurl_with_a_token(learner: str, certs: Path) -> None:
-    reader = certs / "reader"
-    secret = tokens.Tokens(str(reader / "tokens")).own(Role.READER).secret
-    tls = [
-        "-cacert",
-        str(reader / "ca.pem"),
-        "-cert",
-        str(reader / "cert.pem"),
-        "-key",
-        str(reader / "key.pem"),
-    ]
-    listed = grpcurl(*tls, "-H", f"authorization: Bearer {secret}", learner, "list")
-    assert "liir.v1.CheckpointService" in listed.stdout.split(), listed.stderr
-    assert "got none" in grpcurl(*tls, learner, "list").stderr
+def test_grpcurl_is_let_in_as_documented_and_not_with_less(learner: str, certs: Path) -> None:
+    block = re.search(r"```\n(TOKEN=.*?)```", (ROOT / "docs/api.md").read_text(), re.DOTALL)
+    assert block
+    commands = block[1].replace("learner.example:50051", learner)
+    status, certificate, header = "liir.v1.TrainingService/GetStatus", r"-cert \S+ -key \S+", '-H ".*?"'
+    assert REACHED in shell(commands, certs)
+    assert "liir.v1.CheckpointService" in shell(commands.replace(status, "list"), certs).split()
+    assert "got none" in shell(re.sub(header, "", commands), certs)
+    uncertified = re.sub(certificate, "-connect-timeout 2", commands)
+    assert "Failed to dial" in shell(uncertified, certs)
 
 
 def test_without_a_token_only_health_answers(learner: str, certs: Path) -> None:

@@ -224,6 +224,10 @@ def test_up_deaths_rotations_down_and_up_again(compose: Compose) -> None:
         assert not compose.processes(service, "ray::ActorProcess")
     wait_for(lambda: query('max_over_time(liir_win_rate{actions="sampled"}[1h])') > 0, "a battle won")
 
+    # Nothing of ours runs as root.
+    for service in ("learner", "ray-head", "ray-worker", "actors", "evaluator"):
+        assert compose("exec", service, "id", "-u").strip() == "10001"
+
     # A service has the token of its role, and from outside it takes TLS and one, too.
     for service, role in {"ray-worker": "actor", "actors": "actor", "evaluator": "evaluator"}.items():
         assert re.fullmatch(rf"{role} \S+\n", compose("exec", service, "cat", "/certs/tokens"))

@@ -7,6 +7,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 from urllib.parse import urlsplit
 
+import pytest
 import yaml
 from ray._private import ray_constants
 
@@ -18,12 +19,18 @@ ROLES = {
     "actors": "actor",
     "evaluator": "evaluator",
 }
+OURS = {"certs", "learner", "ray-head", "ray-worker", "actors", "evaluator"}
+OTHERS = {"prometheus", "grafana"}
 DRAIN = "RAY_GRACEFUL_SHUTDOWN_DRAIN_TIMEOUT_S"
+COMPLETE, HEALTHY = "service_completed_successfully", "service_healthy"
+
+
+def composed() -> dict[str, Any]:
+    return yaml.safe_load((ROOT / "docker-compose.yml").read_text())  # type: ignore[no-any-return]
 
 
 def services() -> dict[str, Any]:
-    text = (ROOT / "docker-compose.yml").read_text()
-    return yaml.safe_load(text)["services"]  # type: ignore[no-any-return]
+    return composed()["services"]  # type: ignore[no-any-return]
 
 
 def test_a_service_mounts_the_folder_of_its_role_to_read() -> None:
@@ -61,8 +68,46 @@ def test_every_ray_node_has_the_token_of_the_others() -> None:
     assert [wanted.items() <= service["environment"].items() for service in nodes] == [True] * 3
 
 
-def test_what_runs_on_has_a_health_check() -> None:
+def test_what_runs_on_has_a_health_check_and_is_started_again() -> None:
+    assert services().keys() == OURS | OTHERS
     assert [name for name, service in services().items() if "healthcheck" not in service] == ["certs"]
+    restarts = {name: service.get("restart") for name, service in services().items()}
+    assert restarts == dict.fromkeys(OURS | OTHERS, "unless-stopped") | {"certs": None}
+
+
+@pytest.mark.parametrize("name", sorted(OURS))
+def test_ours_can_do_no_more_than_they_must_and_get_time_to_end(name: str) -> None:
+    service = services()[name]
+    assert service["cap_drop"] == ["ALL"]
+    assert service["security_opt"] == ["no-new-privileges:true"]
+    assert not {"cap_add", "privileged", "user"} & service.keys()
+    # Docker's own ten seconds are too few on a loaded machine; the learner saves its state in them, too.
+    assert service["stop_grace_period"] == ("60s" if name == "learner" else "20s")
+
+
+def test_what_is_written_lies_in_named_volumes() -> None:
+    mounts = [mount.split(":") for service in services().values() for mount in service.get("volumes", ())]
+    written = {source for source, _, *options in mounts if options != ["ro"]}
+    assert written == composed()["volumes"].keys()
+    assert "runs:/runs" in services()["learner"]["volumes"]
+    assert "--run-dir /runs/" in services()["learner"]["command"]
+
+
+def test_each_starts_when_what_it_needs_is_there() -> None:
+    conditions = {
+        name: {needed: how["condition"] for needed, how in service.get("depends_on", {}).items()}
+        for name, service in services().items()
+    }
+    assert conditions == {
+        "certs": {},
+        "learner": {"certs": COMPLETE},
+        "ray-head": {"certs": COMPLETE},
+        "ray-worker": {"certs": COMPLETE, "ray-head": HEALTHY},
+        "actors": {"learner": HEALTHY, "ray-worker": HEALTHY},
+        "evaluator": {"learner": HEALTHY, "actors": HEALTHY},
+        "prometheus": {},
+        "grafana": {"prometheus": HEALTHY},
+    }
 
 
 def test_nothing_permits_plaintext_and_ports_are_on_loopback() -> None:
@@ -74,6 +119,7 @@ def test_nothing_permits_plaintext_and_ports_are_on_loopback() -> None:
 
 def test_who_watches_is_needed_by_nobody_and_keeps_its_data() -> None:
     watchers = {"prometheus": "/prometheus", "grafana": "/var/lib/grafana"}
+    assert watchers.keys() == OTHERS
     for name, service in services().items():
         if name not in watchers:
             assert not watchers.keys() & service.get("depends_on", {}).keys()

@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import re
 import signal
+import subprocess
 import sys
 import tempfile
 import time
@@ -18,9 +19,11 @@ from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
+import grpc
 import numpy as np
 import psutil
 
+from liir_common.client import TrainingClient
 from tests.e2e import service
 
 ACTORS = 8
@@ -71,6 +74,10 @@ class Growth(NamedTuple):
     per_hour: float
     error: float
     hours: float
+
+
+class EndedError(Exception):
+    """What was to be measured to the end is gone."""
 
 
 class Most(NamedTuple):
@@ -166,7 +173,9 @@ class Family:
 
     def _look(self) -> list[psutil.Process]:
         """All there are now; the new ones get names."""
-        found = [self._launcher, *self._launcher.children(recursive=True)]
+        found = [self._launcher]
+        with suppress(psutil.NoSuchProcess):
+            found += self._launcher.children(recursive=True)
         for process in found:
             if process not in self._names:
                 with suppress(psutil.NoSuchProcess):  # or a zombie, which is counted all the same
@@ -182,16 +191,18 @@ class Family:
         """What all of them hold now.
 
         Raises:
-            psutil.NoSuchProcess: one that was to last has ended, whether another took its place or not.
+            EndedError: one that was to last has ended, whether another took its place or not.
         """
-        found = self._look()
+        found, ended = self._look(), []
         samples.points["training", "processes"].append((now, len(found)))
         for process in self._lasting.union(filter(self._names.get, found)):
             try:
                 samples.add(process, self._names[process], now, thread_names=thread_names)
             except psutil.NoSuchProcess:
                 if process in self._lasting:
-                    raise
+                    ended.append(self._names[process])
+        if ended:
+            raise EndedError(f"after {now:.0f} s gone: {', '.join(sorted(ended))}")
 
 
 def base(name: str) -> str:
@@ -199,28 +210,35 @@ def base(name: str) -> str:
     return name.partition(" #")[0]
 
 
-def measure(run_dir: Path, minutes: float) -> tuple[Samples, int]:
-    """Samples of a training of so many minutes, and its learner steps.
+def measure(samples: Samples, run_dir: Path, minutes: float) -> None:
+    """Add samples of a training of so many minutes.
 
     Raises:
-        psutil.NoSuchProcess: a process of a known kind has ended.
+        EndedError: a process of a known kind has ended, or the learner does not answer.
+        AssertionError: it did not start, or did not end as it was asked to.
+        subprocess.TimeoutExpired: it did not end at all.
     """
-    samples, rounds = Samples(), 0
     with service.training(run_dir, *SETTINGS) as training:
         service.wait_for(lambda: service.learner_step(run_dir) > 0, "the first learner step", START_S)
         with service.client(run_dir) as client:
             service.wait_for(lambda: client.status().actors == ACTORS, "the last actor", START_S)
-            family = Family(psutil.Process(training.pid))
-            begin = time.monotonic()
-            while (now := time.monotonic() - begin) < 60 * minutes:
-                family.sample(samples, now, thread_names=rounds % NAMES_EVERY == 0)
-                samples.points["learner", "streams"].append((now, client.status().actors))
-                rounds += 1
-                time.sleep(EVERY_S)
-            steps = client.status().learner_step
+            sample(samples, Family(psutil.Process(training.pid)), client, minutes)
         training.send_signal(signal.SIGTERM)
         service.finish(training, code=128 + signal.SIGTERM)
-    return samples, steps
+
+
+def sample(samples: Samples, family: Family, client: TrainingClient, minutes: float) -> None:
+    """Add samples for so many minutes; raises what `measure` raises."""
+    begin, rounds = time.monotonic(), 0
+    while (now := time.monotonic() - begin) < 60 * minutes:
+        family.sample(samples, now, thread_names=rounds % NAMES_EVERY == 0)
+        try:
+            streams = client.status().actors
+        except grpc.RpcError as error:
+            raise EndedError(f"after {now:.0f} s the learner does not answer: {error.code().name}") from None
+        samples.points["learner", "streams"].append((now, streams))
+        rounds += 1
+        time.sleep(EVERY_S)
 
 
 def after_warm_up(points: list[tuple[float, T]]) -> list[tuple[float, T]]:
@@ -268,21 +286,28 @@ def report(samples: Samples) -> list[str]:
 
 
 def main() -> int:
-    """Print what was measured; 1 if something grows."""
+    """Print what was measured; 1 if something grows, or if it could not be measured to the end."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--minutes", type=float, default=5.0)
     minutes = parser.parse_args().minutes
+    samples, ended = Samples(), []
     with tempfile.TemporaryDirectory() as folder:
-        samples, steps = measure(Path(folder) / "run", minutes)
+        run_dir = Path(folder) / "run"
+        try:
+            measure(samples, run_dir, minutes)
+        # What hours have brought is reported all the same.
+        except (EndedError, AssertionError, subprocess.TimeoutExpired) as error:
+            ended = [f"not measured to the end: {error}"]
+        steps = service.learner_step(run_dir)
     print(f"{minutes:g} minutes, {steps} learner steps; after a third of the time as warm-up:\n")
-    grew = report(samples)
+    troubles = report(samples) + ended
     for name, noted in samples.threads.items():
         if came := new_threads(noted):
             print(f"{name}: threads that came: {came}")
     unknown = {name for name, _ in samples.points if base(name) not in {*OURS, *RAYS, "training"}}
     print("\nof no known kind: " + (", ".join(sorted(unknown)) or "none"))
-    print("\n".join(grew) or "nothing grows")
-    return bool(grew)
+    print("\n".join(troubles) or "nothing grows")
+    return bool(troubles)
 
 
 if __name__ == "__main__":

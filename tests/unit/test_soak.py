@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 
+import grpc
 import numpy as np
 import psutil
 import pytest
 
+from liir_common.rpc.gen.liir.v1 import training_pb2
 from tests.e2e import service
 from tests.faults import soak
 
@@ -122,8 +126,71 @@ def test_a_process_that_is_gone_ends_it(parent: subprocess.Popen[str]) -> None:
     family = soak.Family(psutil.Process(parent.pid))
     parent.kill()
     parent.wait()
-    with pytest.raises(psutil.NoSuchProcess):
+    with pytest.raises(soak.EndedError, match="after 0 s gone: launcher"):
         family.sample(soak.Samples(), 0.0, thread_names=False)
+
+
+class Learner(nullcontext[None]):
+    """A stand-in for its client; the third time that streams are counted, something ends."""
+
+    def __init__(self, end: Callable[[], None]) -> None:
+        super().__init__()
+        self._end, self._asked = end, 0
+
+    def __enter__(self) -> Learner:  # type: ignore[override]
+        return self
+
+    def status(self) -> training_pb2.GetStatusResponse:
+        self._asked += 1
+        if self._asked == 4:  # the first time it is asked whether all actors are there
+            self._end()
+        return training_pb2.GetStatusResponse(actors=soak.ACTORS)
+
+
+class Unavailable(grpc.RpcError):
+    def code(self) -> grpc.StatusCode:
+        return grpc.StatusCode.UNAVAILABLE
+
+
+def be_silent() -> None:
+    raise Unavailable
+
+
+@pytest.fixture
+def printed_of(
+    parent: subprocess.Popen[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Callable[[Callable[[], None]], str]:
+    """What is printed of a stand-in for a training that does not last, as something ends it."""
+
+    def printed(end: Callable[[], None]) -> str:
+        monkeypatch.setattr(service, "client", lambda _: Learner(end))
+        assert soak.main() == 1
+        return capsys.readouterr().out
+
+    monkeypatch.setattr(soak, "OURS", soak.OURS | {"driver": "sleep 60"})
+    monkeypatch.setattr(soak, "EVERY_S", 0.01)
+    monkeypatch.setattr(sys, "argv", ["soak", "--minutes", "2"])
+    monkeypatch.setattr(service, "training", lambda *_: nullcontext(parent))
+    monkeypatch.setattr(service, "learner_step", lambda _: 42)
+    return printed
+
+
+def test_what_was_sampled_before_a_process_ended_is_reported(
+    parent: subprocess.Popen[str], printed_of: Callable[[Callable[[], None]], str]
+) -> None:
+    printed = printed_of(start_a_child(parent).kill)
+    assert "42 learner steps" in printed
+    assert re.search(r"^driver +threads +1\.0 and was there only from 0 s", printed, re.MULTILINE)
+    assert re.search(r"not measured to the end: after \d+ s gone: driver\n$", printed)
+
+
+def test_what_was_sampled_before_the_learner_fell_silent_is_reported(
+    parent: subprocess.Popen[str], printed_of: Callable[[Callable[[], None]], str]
+) -> None:
+    start_a_child(parent)
+    printed = printed_of(be_silent)
+    assert re.search(r"^learner +streams +8\.0 and was there only from 0 s", printed, re.MULTILINE)
+    assert re.search(r"after \d+ s the learner does not answer: UNAVAILABLE\n$", printed)
 
 
 def test_a_process_of_ours_that_is_missing_is_noticed(

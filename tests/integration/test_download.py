@@ -39,13 +39,19 @@ CHUNK = 64 * 1024
 
 
 class Counted(CheckpointService):
-    """Remembers from where downloads were asked for, and answers slowly if told to."""
+    """Remembers from where downloads and watches were asked for, and answers slowly if told to."""
 
     pause_s = 0.0
 
     def __init__(self, run: RunDirectory) -> None:
         super().__init__(run)
         self.offsets: list[int] = []
+        self.watched_after: list[int] = []
+
+    async def WatchCheckpoints(self, request: Any, context: Any) -> AsyncIterator[Any]:
+        self.watched_after.append(request.after_episode)
+        async for response in super().WatchCheckpoints(request, context):
+            yield response
 
     async def GetCheckpoint(self, request: Any, context: Any) -> AsyncIterator[Any]:
         self.offsets.append(request.offset)
@@ -92,7 +98,8 @@ class Store:
             self.service = Counted(self.run)
             checkpoint_pb2_grpc.add_CheckpointServiceServicer_to_server(self.service, server.grpc)
             await server.start()
-            started.update(port=server.port, end=ended.set, loop=asyncio.get_running_loop())
+            self.loop = asyncio.get_running_loop()
+            started.update(port=server.port, end=ended.set)
             ready.set()
             await ended.wait()
             await server.stop(0)
@@ -103,7 +110,7 @@ class Store:
         try:
             yield f"127.0.0.1:{started['port']}"
         finally:
-            started["loop"].call_soon_threadsafe(started["end"])
+            self.loop.call_soon_threadsafe(started["end"])
             thread.join()
 
 

@@ -392,6 +392,8 @@ def test_evaluations_are_stored_once(learner: tuple[str, Path]) -> None:
         assert caught.value.code() == grpc.StatusCode.INVALID_ARGUMENT
 
 
+# Not complete before twenty episodes of 60 steps at most, but soon after.
+@pytest.mark.parametrize("learner", [("training.total_env_steps=1210",)], indirect=True)
 def test_the_commands_list_watch_rank_and_fetch(learner: tuple[str, Path], tmp_path: Path) -> None:
     address, run_dir = learner
 
@@ -425,6 +427,37 @@ def test_the_commands_list_watch_rank_and_fetch(learner: tuple[str, Path], tmp_p
         checkpoints("list", "--map", "8m")
     with pytest.raises(LiirError, match="no checkpoint of episode 7"):
         checkpoints("get", "7", "-o", str(tmp_path))
+    watching = service.start("checkpoints", "watch", "--map", "3m", "--after", "6", "--learner", address)
+    assert watching.stdout
+    watched = [watching.stdout.readline(), watching.stdout.readline()]  # while the run goes on
+    complete(address, batches=5)
+    _, *listed = checkpoints("list")
+    report_the_rest(address)
+    watched += watching.stdout
+    assert [line.rstrip() for line in watched] == listed
+    assert len(listed) > 2
+    service.finish(watching)
+
+
+def complete(address: str, batches: int) -> None:
+    """Play a run of so many batches to its end; then the learner waits for the tests of its checkpoints."""
+    with TrainingClient(address) as training:
+        while True:
+            service.wait_for(lambda wanted=batches: training.status().learner_step == wanted, "the last step")
+            status = training.status()
+            if status.env_steps >= status.total_env_steps:
+                return
+            play_batches(address, 1)
+            batches += 1
+
+
+def report_the_rest(address: str) -> None:
+    """Hand in a test of every checkpoint that has none."""
+    with CheckpointClient(address) as client:
+        tested = {evaluation.episode for evaluation in client.evaluations()}
+        for frozen in list(client.list()):
+            if frozen.episode not in tested:
+                assert client.report(evaluation_of(frozen))
 
 
 def assert_newest_test_is_shown(run_dir: Path, **wanted: tuple[float, float]) -> None:

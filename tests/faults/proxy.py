@@ -8,13 +8,15 @@ import threading
 import time
 from contextlib import suppress
 
+from liir_common.rpc.channel import KEEPALIVE_MS
+
 _CHUNK_BYTES = 64 * 1024
 _RESET_ON_CLOSE = struct.pack("ii", 1, 0)
 """SO_LINGER on, for no time: the peer gets a reset instead of a goodbye."""
 _ESTABLISHED = 1
 """TCP_ESTABLISHED, in the first byte of TCP_INFO: neither side has said goodbye."""
-_TRAFFIC_S = 5.0
-"""For which a stall waits for something to hold up."""
+_TRAFFIC_S = 2 * KEEPALIVE_MS / 1000
+"""For which a stall waits for something to hold up; a connection at rest has a ping every `KEEPALIVE_MS`."""
 
 
 class Proxy:

@@ -226,7 +226,7 @@ def test_a_silent_peer_is_noticed_and_its_ticket_played_within_fifteen_seconds(
             other.ask(4)
             assert [other.order().episode_id for _ in range(3)] == [1, 2, 3]
             begin = time.monotonic()
-            proxy.stall(60.0)
+            assert proxy.stall(60.0)
             assert other.order().episode_id == 0
             assert time.monotonic() - begin < 15.0
             assert training.status().actors == 1

@@ -151,7 +151,7 @@ def add_ray(supervisor: Supervisor, folder: Path, temporary: Path, nodes: int) -
         "--disable-usage-stats",
     )
     # Ray keeps notes of its own nodes there, and its sockets, whose paths must be short.
-    places = {"RAY_TMPDIR": str(temporary), "RAY_AUTH_MODE": "disabled"}
+    places = {"RAY_TMPDIR": str(temporary), "RAY_AUTH_MODE": os.environ.get("RAY_AUTH_MODE", "disabled")}
     # By that note Ray takes nodes of a head that died for a cluster, and would not start another head here.
     forget = ("/bin/sh", "-c", f'rm -f {temporary}/ray_current_cluster; exec "$0" "$@"')
     head = (str(_BIN / "ray"), "start", "--head", f"--port={address.rpartition(':')[2]}", "--num-cpus=0")

@@ -19,6 +19,7 @@ import psutil
 import pytest
 import yaml
 
+from liir_common.certs import make_certs
 from liir_common.errors import ComputeError, DiskFullError, UnreachableError
 from tests.e2e import service
 from tests.e2e.test_run import assert_same
@@ -287,6 +288,8 @@ def test_a_hundred_faults_change_nothing(
 ) -> None:
     for name, value in yaml.safe_load(COMPOSE.read_text())["x-ray"]["environment"].items():
         monkeypatch.setenv(name, str(value))  # Ray's nodes and the driver go by it
+    make_certs(tmp_path / "certs")
+    monkeypatch.setenv("RAY_AUTH_TOKEN_PATH", str(tmp_path / "certs/actor/ray-token"))
     undisturbed = tmp_path / "undisturbed"
     command = service.start("train", "--run-dir", str(undisturbed), *service.arguments(SETTINGS))
     service.finish(command, timeout_s=600)

@@ -62,6 +62,7 @@ RAY_JOB = closed(
                 "rayClusterSpec": closed(
                     {
                         "rayVersion": {"type": "string"},
+                        "authOptions": closed({"mode": {"enum": ["disabled", "token"]}}),
                         "headGroupSpec": closed({"rayStartParams": TEXTS, "template": POD}, "template"),
                         "workerGroupSpecs": {"type": "array", "items": WORKERS},
                     },
@@ -183,3 +184,7 @@ def test_no_pod_waits_for_its_actors_when_it_is_to_end(job: dict[str, Any]) -> N
 
 def test_kubernetes_runs_the_ray_that_is_installed(job: dict[str, Any]) -> None:
     assert job["spec"]["rayClusterSpec"]["rayVersion"] == ray.__version__
+
+
+def test_ray_on_kubernetes_wants_a_token(job: dict[str, Any]) -> None:
+    assert job["spec"]["rayClusterSpec"]["authOptions"] == {"mode": "token"}

@@ -14,11 +14,13 @@ import yaml
 from liir_common.config import EnvConfig, leaves
 from liir_common.errors import ConfigError
 from liir_common.files import csv_text, last_row, read_table, write_atomic
+from liir_common.results import COLUMNS, identity, method_label, rows
 
 _LEVEL = 0.9
-_IN_A_ROW = 3
-_LAST = 10
-_CURVE = ("episode", "env_steps", "greedy_win_rate", "sampled_win_rate")
+IN_A_ROW = 3
+"""Evaluations that have to reach a level one after the other: one alone can be luck."""
+TEN = 10
+"""Evaluations that a level is the mean of: one alone jumps between 0 and 1."""
 
 
 @dataclass(frozen=True)
@@ -47,8 +49,8 @@ def summarise(run_dir: Path) -> Summary:
     tests = sorted(read_table(run_dir / "evaluations.csv"), key=lambda row: int(row["episode"]))
     greedy = [float(row["greedy_win_rate"]) for row in tests]
     sampled = [float(row["sampled_win_rate"]) for row in tests]
-    first = _first(greedy, 1)
-    lasting = _first(greedy, _IN_A_ROW)
+    first = first_at_level(greedy)
+    lasting = first_at_level(greedy, IN_A_ROW)
     return Summary(
         learner_steps=int(last["learner_step"]),
         env_steps=int(last["env_steps"]),
@@ -57,8 +59,8 @@ def summarise(run_dir: Path) -> Summary:
         first_win_rate_90_env_steps=int(tests[first]["env_steps"]) if first is not None else None,
         first_win_rate_90_seconds=float(tests[first]["seconds"]) if first is not None else None,
         reached_90_env_steps=int(tests[lasting]["env_steps"]) if lasting is not None else None,
-        last_ten_greedy=_mean(greedy[-_LAST:]),
-        last_ten_sampled=_mean(sampled[-_LAST:]),
+        last_ten_greedy=tens(greedy)[-1] if greedy else None,
+        last_ten_sampled=tens(sampled)[-1] if sampled else None,
         best_greedy=max(greedy, default=None),
     )
 
@@ -83,7 +85,7 @@ def print_summary(run_dir: Path, summary: Summary) -> None:
 
 
 def write_results(run_dirs: Sequence[Path], output: Path) -> None:
-    """Gather runs into `output`: runs.csv (a row per run), curves.csv (a row per evaluation), winrate.png.
+    """Gather runs into `output`: runs.csv (a row per run), results.csv (a row per evaluation), winrate.png.
 
     Raises:
         ConfigError: two run directories have the same name.
@@ -97,32 +99,18 @@ def write_results(run_dirs: Sequence[Path], output: Path) -> None:
     groups: dict[str, list[Path]] = {}
     for run_dir, label in zip(run_dirs, curve_labels(configs), strict=True):
         groups.setdefault(label, []).append(run_dir)
-    runs, curves = [], []
-    for run_dir, config in zip(run_dirs, configs, strict=True):
-        run = json.loads((run_dir / "run.json").read_text())
-        label = method_label(config["algorithm"])
-        about = {
-            "run": run_dir.name,
-            "method": label,
-            "map": EnvConfig(**config["env"]).label,
-            "seed": config["seed"],
-        }
-        runs.append({**about, "commit": run["git"], **asdict(summarise(run_dir))})
-        curves += [
-            {"run": run_dir.name} | {column: test[column] for column in _CURVE}
-            for test in read_table(run_dir / "evaluations.csv")
-        ]
+    for run_dir in run_dirs:
         write_atomic(output / f"{run_dir.name}.yaml", (run_dir / "config.yaml").read_bytes())
+    runs = [_named(run_dir) | asdict(summarise(run_dir)) for run_dir in run_dirs]
     write_atomic(output / "runs.csv", csv_text(runs).encode())
-    write_atomic(output / "curves.csv", csv_text(curves, ("run", *_CURVE)).encode())
+    tests = [row for run_dir in run_dirs for row in rows(run_dir)]
+    write_atomic(output / "results.csv", csv_text(tests, COLUMNS).encode())
     plot_win_rate(groups, output / "winrate.png")
 
 
-def method_label(algorithm: Mapping[str, Any]) -> str:
-    """Name of the method that the `algorithm` section configures, its control named with it."""
-    controls = {"λ = 0": algorithm["lambda"] == 0, "η frozen": algorithm["freeze_eta"]}
-    chosen = [name for name, on in controls.items() if on and algorithm["name"] == "liir"]
-    return ", ".join([algorithm["name"], *chosen])
+def _named(run_dir: Path) -> dict[str, Any]:
+    about = identity(run_dir)
+    return {column: about[column] for column in ("run", "method", "map", "seed", "commit")}
 
 
 def curve_labels(configs: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -169,12 +157,15 @@ def smooth(values: Sequence[float], window: int = 5) -> list[float]:
     ]
 
 
-def _first(rates: list[float], in_a_row: int) -> int | None:
+def tens(rates: Sequence[float]) -> list[float]:
+    """Means of ten rates in a row, from the first ten to the last, or of all where there are fewer."""
+    return smooth(rates, TEN)[min(TEN, len(rates)) - 1 :]
+
+
+def first_at_level(rates: Sequence[float], in_a_row: int = 1) -> int | None:
+    """Index of the first rate of 90 % that so many in a row begin with; None if there is none."""
     for i in range(len(rates) - in_a_row + 1):
-        if all(rate >= _LEVEL for rate in rates[i : i + in_a_row]):
+        # A mean of ten that is 90 % may be less by a rounding.
+        if all(rate > _LEVEL - 1e-9 for rate in rates[i : i + in_a_row]):
             return i
     return None
-
-
-def _mean(values: list[float]) -> float | None:
-    return sum(values) / len(values) if values else None

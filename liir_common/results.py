@@ -15,10 +15,8 @@ import yaml
 from liir_common.config import EnvConfig, holds_run
 from liir_common.errors import ConfigError
 from liir_common.files import read_table
-from liir_common.report import method_label
 
 _COPIED = (
-    "policy_version",
     "greedy_wins",
     "greedy_episodes",
     "greedy_win_rate",
@@ -27,7 +25,7 @@ _COPIED = (
     "sampled_win_rate",
 )
 COLUMNS = ("run", "method", "map", "seed", "commit", "config_digest", "episode", "env_steps", *_COPIED)
-"""Columns of a results file, read and written in this order."""
+"""Columns of a results file, written in this order; a file may have more."""
 
 
 def what_matters(tree: Mapping[str, Any]) -> dict[str, Any]:
@@ -46,8 +44,27 @@ def config_digest(tree: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(what_matters(tree), sort_keys=True).encode()).hexdigest()[:12]
 
 
+def method_label(algorithm: Mapping[str, Any]) -> str:
+    """Name of the method that the `algorithm` section configures, its control named with it."""
+    controls = {"λ = 0": algorithm["lambda"] == 0, "η frozen": algorithm["freeze_eta"]}
+    chosen = [name for name, on in controls.items() if on and algorithm["name"] == "liir"]
+    return ", ".join([algorithm["name"], *chosen])
+
+
 def rows(run_dir: Path, method: str = "", map_name: str = "") -> list[dict[str, Any]]:
     """The rows of one run, by episode; `method` and `map_name` replace what its configuration calls them.
+
+    Raises:
+        ConfigError: there is no run.
+    """
+    about = identity(run_dir, method, map_name)
+    tests = sorted(read_table(run_dir / "evaluations.csv"), key=lambda row: int(row["episode"]))
+    copied = ("episode", "env_steps", *_COPIED)
+    return [about | {column: test[column] for column in copied} for test in tests]
+
+
+def identity(run_dir: Path, method: str = "", map_name: str = "") -> dict[str, Any]:
+    """The columns of `rows` that are the same in every row of a run.
 
     Raises:
         ConfigError: there is no run.
@@ -55,7 +72,7 @@ def rows(run_dir: Path, method: str = "", map_name: str = "") -> list[dict[str, 
     if not holds_run(run_dir):
         raise ConfigError(f"{run_dir} holds no run")
     tree = yaml.safe_load((run_dir / "config.yaml").read_text(encoding="utf-8"))
-    about = {
+    return {
         "run": run_dir.name,
         "method": method or method_label(tree["algorithm"]),
         "map": map_name or EnvConfig(**tree["env"]).label,
@@ -63,9 +80,6 @@ def rows(run_dir: Path, method: str = "", map_name: str = "") -> list[dict[str, 
         "commit": json.loads((run_dir / "run.json").read_text())["git"],
         "config_digest": config_digest(tree),
     }
-    tests = sorted(read_table(run_dir / "evaluations.csv"), key=lambda row: int(row["episode"]))
-    copied = ("episode", "env_steps", *_COPIED)
-    return [about | {column: test[column] for column in copied} for test in tests]
 
 
 @dataclass(frozen=True)
@@ -79,18 +93,38 @@ class Curve:
     wins: list[int]
     """Greedy wins"""
     episodes: list[int]
+    """Greedy ones"""
+    sampled_wins: list[int]
+    sampled_episodes: list[int]
 
     @property
     def rates(self) -> list[float]:
         """Greedy win rates."""
-        return [wins / episodes for wins, episodes in zip(self.wins, self.episodes, strict=True)]
+        return _rates(self.wins, self.episodes)
+
+    @property
+    def sampled_rates(self) -> list[float]:
+        """Win rates of sampled actions."""
+        return _rates(self.sampled_wins, self.sampled_episodes)
 
     def until(self, env_steps: int) -> Curve:
         """The same up to there, and at least its first evaluation."""
         end = max(1, bisect_right(self.env_steps, env_steps))
-        return replace(
-            self, env_steps=self.env_steps[:end], wins=self.wins[:end], episodes=self.episodes[:end]
-        )
+        return replace(self, **{name: getattr(self, name)[:end] for name in _COUNTS})
+
+
+_COUNTS = {
+    "env_steps": "env_steps",
+    "wins": "greedy_wins",
+    "episodes": "greedy_episodes",
+    "sampled_wins": "sampled_wins",
+    "sampled_episodes": "sampled_episodes",
+}
+"""Fields of a curve by evaluation, and their columns"""
+
+
+def _rates(wins: Sequence[int], episodes: Sequence[int]) -> list[float]:
+    return [won / of for won, of in zip(wins, episodes, strict=True)]
 
 
 def read_curves(sources: Sequence[Path]) -> list[Curve]:
@@ -128,11 +162,5 @@ def _curve(map_name: str, method: str, seed: int, found: list[Mapping[str, Any]]
             "leave out all but one"
         )
     found.sort(key=lambda row: int(row["episode"]))
-    return Curve(
-        method,
-        map_name,
-        seed,
-        [int(row["env_steps"]) for row in found],
-        [int(row["greedy_wins"]) for row in found],
-        [int(row["greedy_episodes"]) for row in found],
-    )
+    counts = {name: [int(row[column]) for row in found] for name, column in _COUNTS.items()}
+    return Curve(method, map_name, seed, **counts)

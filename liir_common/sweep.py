@@ -246,11 +246,14 @@ class Sweep:
         begun = [run for run in self._runs if holds_run(self._output / run.name)]
         rows = [row for run in begun for row in results.rows(self._output / run.name, run.method, run.map)]
         self._replace_rows("results.csv", rows, results.COLUMNS)
-        self._replace_rows("runs.csv", [self._row(run) for run in self._runs])
+        status = [self._row(run) for run in self._runs]
+        self._replace_rows("runs.csv", status, list(status[0]))
 
-    def _replace_rows(self, name: str, rows: list[dict[str, Any]], columns: Sequence[str] = ()) -> None:
+    def _replace_rows(self, name: str, rows: list[dict[str, Any]], columns: Sequence[str]) -> None:
         planned = {run.name for run in self._runs}
-        others = [row for row in read_table(self._output / name) if row["run"] not in planned]
+        kept = [row for row in read_table(self._output / name) if row["run"] not in planned]
+        # An earlier build's file may have a column more.
+        others = [{column: row[column] for column in columns} for row in kept]
         write_atomic(self._output / name, csv_text([*others, *rows], columns).encode())
 
     def _row(self, run: Run) -> dict[str, Any]:

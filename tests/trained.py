@@ -51,12 +51,15 @@ def make_run(path: Path, *settings: str, episodes: tuple[int, ...] = (100,)) -> 
     return path
 
 
-def add_evaluations(path: Path, wins: list[int], episodes: int = 20, spacing: int = 1000) -> Path:
-    """Give a run `wins` of its test episodes at every 100th training episode."""
+def add_evaluations(
+    path: Path, wins: list[int], episodes: int = 20, spacing: int = 1000, sampled: list[int] | None = None
+) -> Path:
+    """Give a run `wins` of its test episodes at every 100th training episode, as many of `sampled` ones."""
     table = Table(path / "evaluations.csv")
-    for index, won in reversed(list(enumerate(wins, start=1))):  # reports may come in any order
+    both = list(zip(wins, sampled or wins, strict=True))
+    for index, pair in reversed(list(enumerate(both, start=1))):  # reports may come in any order
         row = {"episode": 100 * index, "env_steps": spacing * index, "policy_version": index}
-        for mode in ("greedy", "sampled"):
+        for mode, won in zip(("greedy", "sampled"), pair, strict=True):
             tested = {"episodes": episodes, "wins": won, "win_rate": won / episodes}
             row |= {f"{mode}_{key}": value for key, value in tested.items()}
         table.append(row)

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from liir_common import options
-from liir_common.cli.shared import Output, names, numbers, written
+from liir_common.cli.shared import Output, by_map, names, numbers, written
 from liir_common.errors import ConfigError
 
 app = typer.Typer()
@@ -55,7 +55,7 @@ def _sweep(runs: Any, folder: Path, jobs: int) -> None:
 def report(
     run_dirs: list[Path],
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Folder for runs.csv, curves.csv and one curve.")
+        Path | None, typer.Option("--output", "-o", help="Folder for runs.csv, results.csv and their curves.")
     ] = None,
 ) -> None:
     """Write summary.json and winrate.png of each run again; with -o, gather the runs as results."""
@@ -134,15 +134,24 @@ def _of(figures: dict[str, float]) -> str:
 @figure.command("3")
 def figure_3(
     sources: Annotated[list[Path], typer.Argument(help="Results files of sweeps, or run directories.")],
+    lowest_from: Annotated[
+        str,
+        typer.Option(
+            "--from", help="MAP=STEPS,…: tabulate also the lowest level from these environment steps on."
+        ),
+    ] = "",
     output: Output = Path(),
 ) -> None:
-    """Win rate against environment steps, a panel per map, and the table of final and best win rates."""
-    from liir_common.figures.curves import markdown, write_figure
+    """Win rate against environment steps, a panel per map, and tables of means over seeds and of runs."""
+    from liir_common.figures.curves import write_figure
     from liir_common.results import read_curves
 
+    steps = by_map(lowest_from)
     curves = read_curves(sources)
+    if unknown := steps.keys() - {curve.map for curve in curves}:
+        raise ConfigError(f"--from names {', '.join(sorted(unknown))}, of which there is no run")
     with written(output):
-        print(markdown(write_figure(curves, output)), end="")
+        print(write_figure(curves, output, steps), end="")
     print(output / "figure3.png")
 
 

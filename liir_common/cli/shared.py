@@ -33,6 +33,18 @@ def numbers(text: str) -> list[int]:
         raise ConfigError(f"wanted whole numbers separated by commas, got {text!r}") from None
 
 
+def by_map(text: str) -> dict[str, int]:
+    """The numbers in `text`, MAP=NUMBER separated by commas, by map.
+
+    Raises:
+        ConfigError: there is something else.
+    """
+    try:
+        return {name: int(number) for name, number in (part.split("=") for part in names(text))}
+    except ValueError:
+        raise ConfigError(f"wanted MAP=NUMBER, separated by commas, got {text!r}") from None
+
+
 def written(output: Path) -> AbstractContextManager[None]:
     """A block that writes to `output`; what the operating system refuses is an error with code 6."""
     return storage_explained(output, "call this again")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from bisect import bisect_left
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from math import ceil
 from pathlib import Path
@@ -12,12 +13,10 @@ import numpy as np
 
 from liir_common.figures.statistics import Interval, Values, bootstrap, wilson
 from liir_common.files import csv_text, write_atomic
-from liir_common.report import smooth
+from liir_common.report import IN_A_ROW, TEN, first_at_level, smooth, tens
 from liir_common.results import Curve
 
-_WINDOW = 10
-"""Evaluations that a level is the mean of: one alone jumps between 0 and 1."""
-_GOAL = 0.9
+_BETWEEN = "\nAbove, all seeds of a method end where the shortest ends; below, each run at its own end.\n\n"
 _POINTS = 200
 _PANELS = 5
 """Maps in a row of the figure"""
@@ -59,6 +58,26 @@ class Row:
         }
 
 
+@dataclass(frozen=True)
+class RunRow:
+    """One run to its own end; levels are win rates, means of ten evaluations in a row."""
+
+    map: str
+    method: str
+    seed: int
+    env_steps: int
+    three_env_steps: int | None
+    """First of the first three greedy evaluations in a row that are at 90 % or above"""
+    ten_env_steps: int | None
+    """Last of the first ten greedy evaluations that are at 90 % together"""
+    lowest_after: float | None
+    """Lowest greedy level from those ten on"""
+    lowest_from: tuple[float, float] | None
+    """Lowest level, greedy and sampled, of ten evaluations that all come from a given step on"""
+    last: tuple[float, float]
+    """Greedy and sampled"""
+
+
 def _interval(interval: Interval | None) -> str:
     return "" if interval is None else f"{interval[0]:.4f} {interval[1]:.4f}"
 
@@ -83,10 +102,11 @@ def tabulate(curves: Sequence[Curve]) -> list[Row]:
 def _row(map_name: str, method: str, runs: Sequence[Curve]) -> Row:
     env_steps = min(run.env_steps[-1] for run in runs)
     runs = [run.until(env_steps) for run in runs]
-    final = [float(np.mean(run.rates[-_WINDOW:])) for run in runs]
-    best = [float(_means(run.rates, _WINDOW).max()) for run in runs]
-    wins = sum(sum(run.wins[-_WINDOW:]) for run in runs)
-    episodes = sum(sum(run.episodes[-_WINDOW:]) for run in runs)
+    levels = [tens(run.rates) for run in runs]
+    final = [of[-1] for of in levels]
+    best = [max(of) for of in levels]
+    wins = sum(sum(run.wins[-TEN:]) for run in runs)
+    episodes = sum(sum(run.episodes[-TEN:]) for run in runs)
     return Row(
         map_name,
         method,
@@ -97,32 +117,90 @@ def _row(map_name: str, method: str, runs: Sequence[Curve]) -> Row:
         wilson(wins, episodes),
         float(np.mean(best)),
         bootstrap(best),
-        tuple(steps for run in runs for steps in _first_at_goal(run)),
+        tuple(run.env_steps[first + TEN - 1] for run in runs if (first := _first_ten(run)) is not None),
     )
 
 
-def _first_at_goal(run: Curve) -> list[int]:
-    at_goal = np.flatnonzero(_means(run.rates, _WINDOW) > _GOAL - 1e-9)
-    return [run.env_steps[at_goal[0] + _WINDOW - 1]] if len(at_goal) and len(run.rates) >= _WINDOW else []
+def _first_ten(run: Curve) -> int | None:
+    """Index of the evaluation that the first ten at 90 % together begin with."""
+    return first_at_level(tens(run.rates)) if len(run.rates) >= TEN else None
 
 
-def _means(values: Sequence[float], window: int) -> Values:
-    """Means of `window` values in a row, or of all where there are fewer."""
-    width = min(window, len(values))
-    return np.convolve(values, np.full(width, 1 / width), "valid")
+def tabulate_runs(curves: Sequence[Curve], lowest_from: Mapping[str, int]) -> list[RunRow]:
+    """A row per run; `lowest_from` has the environment step of each map that `RunRow.lowest_from` is of."""
+    return [
+        _run_row(run, lowest_from.get(map_name))
+        for map_name, methods in groups(curves).items()
+        for runs in methods.values()
+        for run in runs
+    ]
+
+
+def _run_row(run: Curve, env_steps: int | None) -> RunRow:
+    greedy, sampled = tens(run.rates), tens(run.sampled_rates)
+    three, ten = first_at_level(run.rates, IN_A_ROW), _first_ten(run)
+    start = len(run.rates) if env_steps is None else bisect_left(run.env_steps, env_steps)
+    return RunRow(
+        run.map,
+        run.method,
+        run.seed,
+        run.env_steps[-1],
+        None if three is None else run.env_steps[three],
+        None if ten is None else run.env_steps[ten + TEN - 1],
+        None if ten is None else min(greedy[ten:]),
+        (min(greedy[start:]), min(sampled[start:])) if start + TEN <= len(run.rates) else None,
+        (greedy[-1], sampled[-1]),
+    )
 
 
 def markdown(rows: Sequence[Row]) -> str:
-    """The table for people; win rates in percent, intervals of 95 %."""
+    """The table of means for people; win rates in percent, intervals of 95 %."""
     levels = ("final", "over seeds", "over episodes", "best", "over seeds", "90 % from")
-    columns = ("map", "method", "seeds", "env steps", *levels)
-    head = f"| {' | '.join(columns)} |\n{'|---' * len(columns)}|\n"
-    return head + "".join(
+    return _head(("map", "method", "seeds", "env steps", *levels)) + "".join(
         f"| {r.map} | {r.method} | {r.seeds} | {r.env_steps:,} | {100 * r.final:.1f} "
         f"| {_percent(r.final_seeds)} | {_percent(r.final_episodes)} "
         f"| {100 * r.best:.1f} | {_percent(r.best_seeds)} | {_goal(r)} |\n"
         for r in rows
     )
+
+
+def markdown_runs(rows: Sequence[RunRow], lowest_from: Mapping[str, int]) -> str:
+    """The table of runs for people; win rates in percent, with columns more for a `lowest_from`."""
+    cells = [_run_cells(row, lowest_from) for row in rows]
+    return _head(list(cells[0])) + "".join(f"| {' | '.join(line.values())} |\n" for line in cells)
+
+
+def _run_cells(row: RunRow, lowest_from: Mapping[str, int]) -> dict[str, str]:
+    greedy, sampled = row.lowest_from or (None, None)
+    later = {
+        "from": _steps(lowest_from.get(row.map)),
+        "lowest greedy": _level(greedy),
+        "lowest sampled": _level(sampled),
+    }
+    return {
+        "map": row.map,
+        "method": row.method,
+        "seed": str(row.seed),
+        "env steps": _steps(row.env_steps),
+        "three at 90 % in a row from": _steps(row.three_env_steps),
+        "90 % from": _steps(row.ten_env_steps),
+        "lowest after": _level(row.lowest_after),
+        **(later if lowest_from else {}),
+        "last ten greedy": _level(row.last[0]),
+        "last ten sampled": _level(row.last[1]),
+    }
+
+
+def _steps(env_steps: int | None) -> str:
+    return "–" if env_steps is None else f"{env_steps:,}"
+
+
+def _level(rate: float | None) -> str:
+    return "–" if rate is None else f"{100 * rate:.1f}"
+
+
+def _head(columns: Sequence[str]) -> str:
+    return f"| {' | '.join(columns)} |\n{'|---' * len(columns)}|\n"
 
 
 def _percent(interval: Interval | None) -> str:
@@ -162,15 +240,20 @@ def mean_curve(runs: Sequence[Curve]) -> tuple[Values, Values, Values]:
     return grid, np.mean(rates, 0), np.std(rates, 0, ddof=1 if len(runs) > 1 else 0)
 
 
-def write_figure(curves: Sequence[Curve], output: Path) -> list[Row]:
-    """Write figure3.png, .md and .csv (the table) and figure3-points.csv (every evaluation) into `output`."""
+def write_figure(curves: Sequence[Curve], output: Path, lowest_from: Mapping[str, int] | None = None) -> str:
+    """Write figure3.png, .md (both tables), .csv (that of means) and figure3-points.csv (every evaluation).
+
+    `lowest_from` has environment steps by map, see `tabulate_runs`. Returns the text of figure3.md.
+    """
     output.mkdir(parents=True, exist_ok=True)
     table = tabulate(curves)
-    write_atomic(output / "figure3.md", markdown(table).encode())
+    steps = lowest_from or {}
+    text = markdown(table) + _BETWEEN + markdown_runs(tabulate_runs(curves, steps), steps)
+    write_atomic(output / "figure3.md", text.encode())
     write_atomic(output / "figure3.csv", csv_text([row.cells() for row in table]).encode())
     write_atomic(output / "figure3-points.csv", csv_text(list(points(curves))).encode())
     _draw(groups(curves), output / "figure3.png")
-    return table
+    return text
 
 
 def _draw(by_map: dict[str, dict[str, list[Curve]]], output: Path) -> None:

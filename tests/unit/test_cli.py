@@ -24,6 +24,7 @@ from tests.trained import add_evaluations, make_run
 
 ROOT = Path(__file__).parents[2]
 TEXTS = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md"), *(ROOT / "configs").glob("*.yaml")]
+RESULTS = ROOT / "docs" / "results"
 # The processes' own entry points parse what follows these.
 PASS_ON = {"learner", "actors", "evaluator"}
 
@@ -126,6 +127,28 @@ def test_figure_3_is_drawn_from_run_directories(tmp_path: Path) -> None:
     assert (tmp_path / "out" / "figure3.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_figure_3_is_asked_for_the_lowest_level_from_a_step_of_a_map_on(tmp_path: Path) -> None:
+    runs = evaluated(tmp_path)
+    printed = liir("figure", "3", *runs, "--from", "3m=2000", "-o", tmp_path / "out")
+    assert printed.count("| 2,000 | 50.0 | 50.0 |") == printed.count("| 2,000 | 20.0 | 20.0 |") == 1
+    with pytest.raises(ConfigError, match="--from names 8m, of which there is no run"):
+        liir("figure", "3", *runs, "--from", "3m=2000,8m=2000", "-o", tmp_path / "out")
+    with pytest.raises(ConfigError, match="wanted MAP=NUMBER, separated by commas, got '2000'"):
+        liir("figure", "3", *runs, "--from", "2000", "-o", tmp_path / "out")
+
+
+@pytest.mark.parametrize("name", sorted(path.parent.name for path in RESULTS.glob("*/figure3.md")))
+def test_the_kept_results_give_the_tables_beside_them(name: str, tmp_path: Path) -> None:
+    """By the command in their README, which is for bash."""
+    folder = RESULTS / name
+    quoted = re.search(r"^liir (figure 3 (?:.*\\\n)*.*)", (folder / "README.md").read_text(), re.M)
+    assert quoted, f"{folder} does not say how its figure is drawn"
+    command = f"'{sys.executable}' -m liir_common.cli {quoted[1]} -o '{tmp_path}'"
+    subprocess.run(["bash", "-c", command], cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
+    for table in ("figure3.md", "figure3.csv"):
+        assert (tmp_path / table).read_text() == (folder / table).read_text()
+
+
 @pytest.mark.parametrize(("number", "map_name"), [("4", "3m"), ("5", "2s3z")])
 def test_figures_4_and_5_show_the_battle_that_is_asked_for(
     number: str, map_name: str, tmp_path: Path
@@ -164,7 +187,7 @@ def test_a_report_is_written_into_its_run_and_gathered(tmp_path: Path) -> None:
         assert (run / "winrate.png").read_bytes().startswith(b"\x89PNG")
     rows = read_table(tmp_path / "out" / "runs.csv")
     assert [(row["run"], row["best_greedy"]) for row in rows] == [("a", "0.5"), ("b", "0.2")]
-    assert len(read_table(tmp_path / "out" / "curves.csv")) == 22
+    assert len(read_table(tmp_path / "out" / "results.csv")) == 22
     with pytest.raises(ConfigError, match="holds no run"):
         liir("report", tmp_path / "out")
 

@@ -7,7 +7,15 @@ import pytest
 from matplotlib.image import imread
 
 from liir_common.errors import ConfigError
-from liir_common.figures.curves import markdown, mean_curve, points, tabulate, write_figure
+from liir_common.figures.curves import (
+    markdown,
+    markdown_runs,
+    mean_curve,
+    points,
+    tabulate,
+    tabulate_runs,
+    write_figure,
+)
 from liir_common.files import csv_text, read_table
 from liir_common.results import COLUMNS, config_digest, read_curves, rows
 from tests.trained import add_evaluations, make_run
@@ -32,6 +40,13 @@ def test_a_results_file_and_run_directories_say_the_same(tmp_path: Path) -> None
     assert (first.method, first.map, first.seed) == ("liir", "3m", 1)
     assert first.env_steps == [1000 * i for i in range(1, 21)]
     assert first.rates == [0.0] * 10 + [1.0] * 10
+
+
+def test_a_results_file_with_a_column_of_an_earlier_build_is_read(tmp_path: Path) -> None:
+    found = runs(tmp_path)[:1]
+    old = [row | {"policy_version": 7} for row in rows(found[0])]
+    (tmp_path / "results.csv").write_text(csv_text(old))
+    assert read_curves([tmp_path / "results.csv"]) == read_curves(found)
 
 
 def test_the_digest_is_of_what_the_numbers_depend_on(tmp_path: Path) -> None:
@@ -76,6 +91,36 @@ def test_the_goal_is_reached_by_ten_evaluations_together(tmp_path: Path) -> None
     assert markdown([row]).endswith("| – (0 of 1) |\n")
 
 
+def lines_of_runs(found: list[Path], lowest_from: dict[str, int]) -> list[str]:
+    """The table of runs without its head."""
+    table = tabulate_runs(read_curves(found), lowest_from)
+    return markdown_runs(table, lowest_from).splitlines()[2:]
+
+
+def test_every_run_is_tabulated_to_its_own_end(tmp_path: Path) -> None:
+    """Seed 1 wins 90 % twice in a row, then from the tenth evaluation on three times; 180 of 200 battles
+    of evaluations 9 to 18, 156 of 12 to 21, 189 of 21 to 30, 196 of 22 to 31. Seed 2's first ten at 90 % are
+    the lowest after."""
+    wins = [0] * 5 + [20, 18, 0, 17, 18, 18, 18] + [20] * 5 + [9, 12, 8, 9] + [20] * 9 + [16]
+    first, second = (make_run(tmp_path / f"{seed}", f"seed={seed}", episodes=()) for seed in (1, 2))
+    found = [
+        add_evaluations(first, wins, sampled=[won // 2 for won in wins]),
+        add_evaluations(second, [0] + [18] * 10 + [20] * 10, sampled=[10] * 21),
+    ]
+    assert lines_of_runs(found, {"3m": 21_000}) == [
+        "| 3m | liir | 1 | 31,000 | 10,000 | 18,000 | 78.0 | 21,000 | 94.5 | 47.0 | 98.0 | 49.0 |",
+        "| 3m | liir | 2 | 21,000 | 2,000 | 11,000 | 90.0 | 21,000 | – | – | 100.0 | 50.0 |",
+    ]
+    assert "| 22,000 | 98.0 | 49.0 |" in lines_of_runs(found, {"3m": 22_000})[0]
+    assert lines_of_runs(found, {})[0] == "| 3m | liir | 1 | 31,000 | 10,000 | 18,000 | 78.0 | 98.0 | 49.0 |"
+
+
+def test_nine_evaluations_have_no_ten_together(tmp_path: Path) -> None:
+    run = add_evaluations(make_run(tmp_path / "a", episodes=()), [18] * 9)
+    (line,) = lines_of_runs([run], {"3m": 0})
+    assert line == "| 3m | liir | 1 | 9,000 | 1,000 | – | – | 0 | – | – | 90.0 | 90.0 |"
+
+
 def test_the_mean_ends_where_the_first_seed_does(tmp_path: Path) -> None:
     steps, mean, deviation = mean_curve(read_curves(runs(tmp_path)[:2]))
     assert (steps[0], steps[-1]) == (1000, 15_000)
@@ -99,9 +144,11 @@ def test_every_point_has_its_interval(tmp_path: Path) -> None:
 
 
 def test_the_figure_is_a_picture_with_its_table(tmp_path: Path) -> None:
-    write_figure(read_curves(runs(tmp_path)), tmp_path / "out")
+    text = write_figure(read_curves(runs(tmp_path)), tmp_path / "out")
+    assert text == (tmp_path / "out" / "figure3.md").read_text()
+    assert "\n| 3m | liir | 2 | 15,000 | – | – | – | 20.0 | 20.0 |\n" in text
     assert (tmp_path / "out" / "figure3.png").read_bytes().startswith(b"\x89PNG")
-    assert "| 3m | liir | 2 | 15,000 | 35.0 | 20.0 to 50.0 |" in (tmp_path / "out" / "figure3.md").read_text()
+    assert "| 3m | liir | 2 | 15,000 | 35.0 | 20.0 to 50.0 |" in text
     assert [row["final"] for row in read_table(tmp_path / "out" / "figure3.csv")] == ["0.3500", "0.0000"]
 
 

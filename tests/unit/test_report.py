@@ -10,6 +10,7 @@ from liir_common import config
 from liir_common.errors import ConfigError
 from liir_common.files import Table, read_table
 from liir_common.report import curve_labels, summarise, write_report, write_results
+from liir_common.results import COLUMNS, read_curves
 
 
 def make_run(path: Path, greedy: list[float]) -> Path:
@@ -22,7 +23,11 @@ def make_run(path: Path, greedy: list[float]) -> Path:
                 "episode": 100 * index,
                 "env_steps": 1000 * index,
                 "seconds": 2.0 * index,
+                "greedy_wins": round(40 * rate),
+                "greedy_episodes": 40,
                 "greedy_win_rate": rate,
+                "sampled_wins": round(20 * rate),
+                "sampled_episodes": 40,
                 "sampled_win_rate": rate / 2,
             }
         )
@@ -48,8 +53,8 @@ def test_levels_want_one_and_three_in_a_row(tmp_path: Path) -> None:
 
 
 def test_last_ten_means_ten(tmp_path: Path) -> None:
-    summary = summarise(make_run(tmp_path / "run", [0.0] * 5 + [1.0] * 10))
-    assert summary.last_ten_greedy == 1.0
+    summary = summarise(make_run(tmp_path / "run", [0.0] * 4 + [0.5] + [1.0] * 9))
+    assert (summary.last_ten_greedy, summary.last_ten_sampled) == pytest.approx((0.95, 0.475))
 
 
 def test_a_run_without_evaluations_has_no_curve(tmp_path: Path) -> None:
@@ -73,7 +78,11 @@ def test_results_gather_runs_by_method(tmp_path: Path) -> None:
     rows = read_table(tmp_path / "results" / "runs.csv")
     assert [row["method"] for row in rows] == ["liir", "liir, λ = 0", "central_v"]
     assert {row["commit"] for row in rows} == {"abc"}
-    assert len(read_table(tmp_path / "results" / "curves.csv")) == 6
+    curves = read_curves([tmp_path / "results" / "results.csv"])
+    assert curves == read_curves(runs)
+    assert [curve.method for curve in curves] == ["liir", "liir, λ = 0", "central_v"]
+    assert [curve.rates for curve in curves] == [[0.5, 1.0]] * 3
+    assert [curve.sampled_rates for curve in curves] == [[0.25, 0.5]] * 3
     assert config.load(tmp_path / "results" / "b.yaml", ["preset=none"]).algorithm.lambda_ == 0
     assert (tmp_path / "results" / "winrate.png").exists()
 
@@ -81,8 +90,7 @@ def test_results_gather_runs_by_method(tmp_path: Path) -> None:
 def test_results_of_runs_without_a_test_are_a_header(tmp_path: Path) -> None:
     run = make_result(tmp_path / "a", "evaluation.enabled=false", rates=[])
     write_results([run], tmp_path / "results")
-    text = (tmp_path / "results" / "curves.csv").read_text()
-    assert text == "run,episode,env_steps,greedy_win_rate,sampled_win_rate\n"
+    assert (tmp_path / "results" / "results.csv").read_text() == ",".join(COLUMNS) + "\n"
 
 
 def test_runs_of_one_name_are_refused(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import yaml
 
 from liir_common import config, results
 from liir_common.errors import ConfigError
-from liir_common.files import Table
+from liir_common.files import Table, csv_text, read_table
 from liir_common.sweep import Sweep, is_complete, plan
 from tests.trained import add_evaluations, make_run
 
@@ -138,6 +138,19 @@ def test_a_run_with_other_settings_is_never_mixed_in(sweep: Path, tmp_path: Path
     make_run(folder, "algorithm.entropy=0.5", "algorithm.gamma=0.9", episodes=())
     with pytest.raises(ConfigError, match=r"other settings \(algorithm\.entropy: 0\.5 there, 0\.02 wanted\)"):
         Sweep(runs, tmp_path / "out")
+
+
+def test_rows_of_other_parts_stay_also_with_a_column_of_an_earlier_build(sweep: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    for seed in (1, 2):
+        settings = ("algorithm.entropy=0.02", "algorithm.gamma=0.9", f"seed={seed}")
+        add_evaluations(make_run(folder / f"3m-liir-seed{seed}", *settings, episodes=()), [seed])
+    old = [row | {"policy_version": 7} for row in results.rows(folder / "3m-liir-seed1")]
+    (folder / "results.csv").write_text(csv_text(old))
+    Sweep(plan(sweep, ["liir"], ["3m"], [2]), folder)._write()
+    kept = read_table(folder / "results.csv")
+    assert [(row["seed"], row["greedy_wins"]) for row in kept] == [("1", "1"), ("2", "2")]
+    assert tuple(kept[0]) == results.COLUMNS
 
 
 def test_only_a_larger_budget_belongs_to_a_run_that_is_there(sweep: Path, tmp_path: Path) -> None:

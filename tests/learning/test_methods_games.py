@@ -1,4 +1,4 @@
-"""Games that take what a method is for: QMIX's two-step game, a penalty game, memory, credit among many.
+"""Games that take what a method is for: the two-step game, penalty, climbing, memory, credit among many.
 
 They are played through the PettingZoo loop with the tickets and the kernel that actors use.
 """
@@ -117,6 +117,13 @@ class Penalty(Game):
         return float(self.payoff[actions[0]][actions[1]])
 
 
+class Ruin(Penalty):
+    """A climbing game: the first way is best with a partner who takes it, but on average worse than the
+    second, since with the third it ruins both."""
+
+    payoff = [[1, 0, -2.2], [0, 0.2, -1], [-2.2, -1, -2]]  # noqa: RUF012
+
+
 class Memory(Game):
     """Each agent sees a sign, can do nothing for two steps, and then has to name it without seeing it."""
 
@@ -211,6 +218,19 @@ def test_only_a_mixer_that_the_state_controls_finds_the_eight(name: str, found: 
     """Played uniformly, so that the data are the same for both."""
     player = train(TwoStep(), name, FASTER | OFTEN, updates=80, epsilon=1.0, seed=seed)
     assert mean_return(player, Exploration.GREEDY, episodes=1) == found
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize(("name", "found"), [("qmix", 1.0), ("vdn", 0.2), ("iql", 0.2)])
+def test_only_a_mixer_sees_past_the_ruin_to_the_best_way(name: str, found: float, seed: int) -> None:
+    """Played uniformly, so that the data are the same for all.
+
+    To independent learners, and in a sum of their values, a way is worth its mean over what the other tries:
+    -0.4 the first, -0.27 the second. QMIX's mixer is monotonic and convex, so it can say that a way pays only
+    together; of what it can say, the closest to the payoffs has the first way first.
+    """
+    player = train(Ruin(), name, FASTER, updates=80, epsilon=1.0, seed=seed)
+    assert mean_return(player, Exploration.GREEDY, episodes=1) == pytest.approx(found)
 
 
 @pytest.mark.parametrize("name", ["liir", "central_v", "iac", "coma"])

@@ -80,6 +80,9 @@ def print_summary(run_dir: Path, summary: Summary) -> None:
     for name, value in asdict(summary).items():
         shown = "–" if value is None else f"{value:.4g}" if isinstance(value, float) else value
         print(f"  {name.replace('_', ' '):30} {shown}")
+    counts = json.loads((run_dir / "run.json").read_text()).get("parameters", {})
+    for name, count in counts.items():
+        print(f"  {'parameters of ' + name:30} {count}")
     if summary.evaluations:
         print(f"  curve: {run_dir / 'winrate.png'}")
 

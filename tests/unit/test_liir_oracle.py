@@ -13,7 +13,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from liir_common.config import AlgorithmConfig
+from liir_common.config import PRESETS, AlgorithmConfig, OptimizerConfig
 from liir_common.types import Batch, EnvSpec, policy_shapes
 from services.learner.algorithms import Algorithm, make_algorithm
 from services.learner.bench import synthetic_batch
@@ -29,6 +29,7 @@ State = dict[str, Tensor]
 BASE = {"policy_hidden": 8, "lambda": 0.7, "policy_gain": 1.0, "r_in_gain": 1.0, "r_in_bound": 1.5}
 CASES: dict[str, dict[str, object]] = {
     "strong": {},
+    "paper": PRESETS["paper"]["algorithm"] | {"target_interval": 3},
     "td0": {"gae_lambda": 0.0, "policy_epochs": 1, "normalize_advantages": False},
     "gae": {"policy_epochs": 1, "normalize_advantages": False},
     "normalised": {"policy_epochs": 1},
@@ -321,6 +322,34 @@ def warmed(config: AlgorithmConfig) -> tuple[Algorithm, State]:
     return algorithm, state_of(algorithm)
 
 
+def continued(
+    state: State, name: str, config: OptimizerConfig
+) -> tuple[torch.nn.Parameter, torch.optim.Optimizer]:
+    """Parameters under torch's own optimiser, which goes on from where ours is, but descends."""
+    parameters = torch.nn.Parameter(state[f"{name}.parameters"].clone())
+    optimizer: torch.optim.Optimizer
+    if config.name == "adam":
+        optimizer = torch.optim.Adam([parameters], config.lr, (BETA_1, BETA_2), config.eps)
+    else:
+        optimizer = torch.optim.RMSprop([parameters], config.lr, config.alpha, config.eps)
+    square = state[f"{name}.optimizer.square"]
+    optimizer.state[parameters] = {
+        "step": state[f"{name}.optimizer.steps"].float().clone(),
+        "exp_avg": -state[f"{name}.optimizer.mean"],
+        "exp_avg_sq": square.clone(),
+        "square_avg": square.clone(),
+    }
+    return parameters, optimizer
+
+
+def raised(state: State, gradient: Tensor, config: AlgorithmConfig) -> Tensor:
+    """η a step up the gradient."""
+    eta, optimizer = continued(state, "eta", config.eta_optimizer)
+    eta.grad = -gradient * min(1.0, config.eta_optimizer.clip / float(gradient.norm()))
+    optimizer.step()
+    return eta.detach()
+
+
 def fitted(state: State, name: str, returns: Tensor, batch: Batch, config: AlgorithmConfig) -> Tensor:
     """The critic's parameters after its epochs, by torch's own optimiser."""
     filled = torch.as_tensor(batch.filled)
@@ -330,14 +359,7 @@ def fitted(state: State, name: str, returns: Tensor, batch: Batch, config: Algor
         state = state | {f"{name}.moments": 0.99 * state[f"{name}.moments"] + 0.01 * batch_moments}
         total, first, second = state[f"{name}.moments"]
         target = (target - first / total) / (second / total - (first / total) ** 2).sqrt()
-    parameters = torch.nn.Parameter(state[f"{name}.parameters"].clone())
-    c = config.critic_optimizer
-    optimizer = torch.optim.Adam([parameters], c.lr, (BETA_1, BETA_2), c.eps)
-    optimizer.state[parameters] = {
-        "step": state[f"{name}.optimizer.steps"].float().clone(),
-        "exp_avg": -state[f"{name}.optimizer.mean"],
-        "exp_avg_sq": state[f"{name}.optimizer.square"].clone(),
-    }
+    parameters, optimizer = continued(state, name, config.critic_optimizer)
     x = t64(batch.state[:, :-1])[filled]
     if name == "phi":
         x = torch.cat([x[:, None].expand(-1, SPEC.n_agents, -1), ids(len(x))], -1)
@@ -361,7 +383,8 @@ def test_update_equals_differentiating_through_the_inner_step(case: str) -> None
     after = state_of(algorithm)
     moved = wanted.theta - before["policy.parameters"]
     close(after["policy.parameters"] - before["policy.parameters"], moved, 1e-9)
-    close(eta_gradient(before, after), wanted.eta_gradient, 1e-9)
+    eta = raised(before, wanted.eta_gradient, config)
+    close(after["eta.parameters"] - before["eta.parameters"], eta - before["eta.parameters"], 1e-9)
     close(after["phi.parameters"], fitted(before, "phi", wanted.proxy_return, batch, config), 1e-12)
     close(after["varphi.parameters"], fitted(before, "varphi", wanted.extrinsic_return, batch, config), 1e-12)
     figures = figures_of(wanted, before["eta.parameters"], batch, config)

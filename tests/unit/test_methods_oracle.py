@@ -22,13 +22,12 @@ from services.learner.algorithms.qmix import MonotonicMixer
 from services.learner.algorithms.vdn import Sum
 from tests.states import state_of
 from tests.unit.test_liir_oracle import (
-    BETA_1,
-    BETA_2,
     SPEC,
     Preconditioner,
     State,
     batch_of,
     close,
+    continued,
     mlp,
     network_outputs,
     policy_gradient,
@@ -180,20 +179,7 @@ def regressed(
         moments = 0.99 * state["varphi.moments"] + 0.01 * moments
         total, first, second = moments
         target = (target - first / total) / (second / total - (first / total) ** 2).sqrt()
-    parameters = torch.nn.Parameter(state["varphi.parameters"].clone())
-    c = config.critic_optimizer
-    optimizer: torch.optim.Optimizer
-    entry = {
-        "step": state["varphi.optimizer.steps"].float().clone(),
-        "square_avg": state["varphi.optimizer.square"].clone(),
-        "exp_avg_sq": state["varphi.optimizer.square"].clone(),
-        "exp_avg": -state["varphi.optimizer.mean"],
-    }
-    if c.name == "adam":
-        optimizer = torch.optim.Adam([parameters], c.lr, (BETA_1, BETA_2), c.eps)
-    else:
-        optimizer = torch.optim.RMSprop([parameters], c.lr, c.alpha, c.eps)
-    optimizer.state[parameters] = entry
+    parameters, optimizer = continued(state, "varphi", config.critic_optimizer)
     for _ in range(config.critic_epochs):
         optimizer.zero_grad()
         prediction = mlp(parameters, x, SPEC.n_actions if config.name == "coma" else 1)

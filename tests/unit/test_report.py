@@ -9,7 +9,7 @@ import yaml
 from liir_common import config
 from liir_common.errors import ConfigError
 from liir_common.files import Table, read_table
-from liir_common.report import curve_labels, summarise, write_report, write_results
+from liir_common.report import curve_labels, print_summary, summarise, write_report, write_results
 from liir_common.results import COLUMNS, read_curves
 
 
@@ -55,6 +55,16 @@ def test_levels_want_one_and_three_in_a_row(tmp_path: Path) -> None:
 def test_last_ten_means_ten(tmp_path: Path) -> None:
     summary = summarise(make_run(tmp_path / "run", [0.0] * 4 + [0.5] + [1.0] * 9))
     assert (summary.last_ten_greedy, summary.last_ten_sampled) == pytest.approx((0.95, 0.475))
+
+
+def test_a_summary_shows_the_sizes_of_the_networks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = make_run(tmp_path / "run", [0.5])
+    (run / "run.json").write_text(json.dumps({"parameters": {"theta": 28297, "eta": 12000}}))
+    print_summary(run, summarise(run))
+    shown = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert ["parameters", "of", "theta", "28297"] in shown
+    assert ["parameters", "of", "eta", "12000"] in shown
+    assert ["best", "greedy", "0.5"] in shown
 
 
 def test_a_run_without_evaluations_has_no_curve(tmp_path: Path) -> None:

@@ -119,7 +119,7 @@ def train(settings: dict[str, object], seed: int, updates: int = UPDATES) -> Lea
 
 
 def told_apart(run: Learned) -> bool:
-    """Whether r_in has learned to prefer each player's own lever: one credit for all would prefer the same."""
+    """Whether r_in has learned to prefer each player's own lever; one credit for all prefers the same."""
     learned = run.after - run.before
     return bool(
         learned[0, 0] - learned[0, 2] > 0.25

@@ -57,7 +57,9 @@ def test_last_ten_means_ten(tmp_path: Path) -> None:
     assert (summary.last_ten_greedy, summary.last_ten_sampled) == pytest.approx((0.95, 0.475))
 
 
-def test_a_summary_shows_the_sizes_of_the_networks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_summary_shows_the_sizes_of_the_networks(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     run = make_run(tmp_path / "run", [0.5])
     (run / "run.json").write_text(json.dumps({"parameters": {"theta": 28297, "eta": 12000}}))
     print_summary(run, summarise(run))

@@ -180,6 +180,9 @@ class CheckpointStore:
             self._fs.rm(self._weights_path(episode))
         self._left_over = set()
 
+    def __contains__(self, episode: int) -> bool:
+        return self._there(episode) is not None
+
     def find(self, episode: int) -> Manifest:
         """The manifest of the checkpoint frozen after `episode` episodes.
 
@@ -243,10 +246,7 @@ class CheckpointStore:
         if not self._fs.exists(self._deleted_path):
             return
         with self._fs.open(self._deleted_path, "r") as file:
-            for line in file:
-                # Else it is the header, or what a dying process left; then the checkpoint is still there.
-                if match := re.fullmatch(r"(\d+),(\w+)", line.strip()):
-                    yield int(match[1]), match[2]
+            yield from _deletions(file)
 
     def _append_deletion(self, manifest: Manifest) -> None:
         path, line = self._deleted_path, f"{manifest.episode},{manifest.sha256}"
@@ -283,6 +283,20 @@ class CheckpointStore:
         else:
             # Object stores show an object when it is complete.
             self._fs.pipe_file(path, data)
+
+
+def given_up(folder: Path) -> set[int]:
+    """Episodes of the checkpoints in `folder` that are lost and that somebody chose to go on without."""
+    path = folder / "deleted.csv"
+    lines = path.read_text().splitlines() if path.exists() else []
+    return {episode for episode, sha256 in _deletions(lines) if sha256 == _LOST}
+
+
+def _deletions(lines: Iterable[str]) -> Iterator[tuple[int, str]]:
+    for line in lines:
+        # Else it is the header, or what a dying process left; then the checkpoint is still there.
+        if match := re.fullmatch(r"(\d+),(\w+)", line.strip()):
+            yield int(match[1]), match[2]
 
 
 def _episodes(names: Iterable[str], form: str) -> set[int]:

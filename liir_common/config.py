@@ -91,7 +91,9 @@ class OptimizerConfig(Section):
 
     name: Literal["adam", "rmsprop"] = "adam"
     lr: float = Field(5e-4, gt=0)
+    """Learning rate."""
     eps: float = Field(1e-5, gt=0)
+    """What is added to the root of the mean square that a step is divided by."""
     alpha: float = Field(0.99, ge=0, lt=1)
     """Smoothing of RMSprop's mean square."""
     clip: float = Field(10.0, gt=0)
@@ -140,29 +142,36 @@ class AlgorithmConfig(Section):
     r_in_bound: float = Field(1.0, gt=0)
     """r_in is squashed to ± this value; the paper has no bound, and without one it grows for ever."""
     gamma: float = Field(0.99, ge=0, le=1)
+    """γ, the discount of a step."""
     gae_lambda: float = Field(0.95, ge=0, le=1)
     """λ_g of the returns that values and advantages are made from; 0 is TD(0) as the paper prints it."""
     limit_is_terminal: bool = True
     """Treat the step limit as an end; otherwise bootstrap there."""
     normalize_advantages: bool = True
+    """To mean 0 and deviation 1 over the agents and steps of a batch that count."""
     normalize_values: bool = True
+    """Fit values to returns less their moving mean, through their moving deviation."""
     target_interval: int = Field(0, ge=0)
     """Learner steps between copies to the target networks; 0 means no target networks."""
     policy_epochs: int = Field(4, ge=1)
     """K policy steps per batch; the meta-gradient goes through the last."""
     critic_epochs: int = Field(4, ge=1)
+    """Steps of every value function per batch, each on all of it."""
     ratio_clip: float = Field(0.2, gt=0)
     """PPO's clip of the importance ratio ρ in policy steps, where a batch gives several."""
     ratio_bound: float = Field(0.0, ge=0)
     """ρ is truncated here in v of Eq. (8), and in the policy step where a batch gives one; 0 is no bound, as
     the paper has it. `training.lag: 1`, whose samples are old, sets 1."""
     entropy: float = Field(0.03, ge=0)
+    """Weight of the policy's mean entropy beside the return."""
     orthogonal_init: bool = True
+    """Orthogonal matrices and zero biases at the start; otherwise uniform in ± 1 / √inputs."""
     policy_gain: float = Field(3.0, gt=0)
     """Gain of the policy head under orthogonal init; a small one saturates the GRU (docs/algorithm.md)."""
     r_in_gain: float = Field(0.1, gt=0)
     """Scale of the r_in head at the start."""
     policy_hidden: int = Field(64, ge=1)
+    """Units of the policy's first layer and of its GRU."""
     policy_optimizer: OptimizerConfig = OptimizerConfig()
     eta_optimizer: EtaOptimizerConfig = EtaOptimizerConfig()
     critic_optimizer: OptimizerConfig = OptimizerConfig()
@@ -251,6 +260,7 @@ class LearnerConfig(Section):
     """0 takes a free one; the run directory's endpoints.json says which."""
     metrics_port: int = Field(9101, ge=0, le=65535)
     device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where learning runs; auto takes a GPU if torch finds one."""
     threads: int = Field(1, ge=1)
     """Of a learner step; actors play beside most of it, so more pay only where cores are idle then."""
     insecure: bool = False
@@ -263,6 +273,7 @@ class EvaluationConfig(Section):
     """Tests of the frozen checkpoints."""
 
     enabled: bool = True
+    """Without tests a run has no win rates, and `liir train` starts no evaluator."""
     episodes: int = Field(20, ge=1)
     """Greedy episodes per checkpoint; as many sampled ones are played beside them."""
     metrics_port: int = Field(9103, ge=0, le=65535)
@@ -347,7 +358,7 @@ class Config(BaseSettings):
         preset = str(data.get("preset", "strong"))
         filled = PRESETS.get(preset, {})
         of_method = METHOD_PRESETS.get(_named(data, "algorithm", "name"), {}) if preset != "none" else {}
-        if _named(data, "training", "lag") == "1":
+        if _named(data, "training", "lag") in ("1", "1.0"):
             of_method = of_method | {"ratio_bound": 1.0}
         if _named(data, "env", "kind") == "pettingzoo":
             # Its options are SMAC's, which no other game takes.
@@ -383,7 +394,7 @@ _RMSPROP = {"name": "rmsprop", "lr": 5e-4, "alpha": 0.99, "eps": 1e-5, "clip": 1
 PRESETS: Mapping[str, dict[str, Any]] = {
     # What makes the method learn fast; the defaults of the models above are this preset.
     "strong": {"env": {"options": {"reward_only_positive": True, "state_last_action": False}}},
-    # Much as released: one plain step a batch, no normalisation, own losses count.
+    # The paper's equations with the released settings: one plain step a batch, own losses count.
     "paper": {
         "env": {"options": {"reward_only_positive": False, "state_last_action": False}},
         "algorithm": {

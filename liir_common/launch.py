@@ -13,6 +13,7 @@ import time
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
@@ -221,12 +222,11 @@ class Launcher:
         """
         for signum in (signal.SIGINT, signal.SIGTERM):
             signal.signal(signum, self._on_signal)
-        try:
+        with ExitStack() as last_first:  # where one fails, the others still end
+            for service in (self._learner, self._actors, self._evaluator):
+                last_first.callback(service.end)
             if address := self._start(evaluate):
                 self._watch(address)
-        finally:
-            for service in (self._evaluator, self._actors, self._learner):
-                service.end()
 
     @property
     def stop_signal(self) -> int:

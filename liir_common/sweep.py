@@ -25,6 +25,7 @@ import yaml
 from pydantic import Field, ValidationError
 
 from liir_common import results
+from liir_common.checkpoint import given_up
 from liir_common.config import Config, Section, differences, from_tree, holds_run, merge, parse_settings
 from liir_common.errors import ConfigError
 from liir_common.files import csv_text, last_row, read_table, write_atomic
@@ -229,7 +230,10 @@ class Sweep:
             if code is not None:
                 del self._running[name]
                 self._end(run, self._status(run, code), code)
-                self._write()
+                try:
+                    self._write()
+                except OSError as error:  # the next to end brings all of it, and the others train meanwhile
+                    _say(f"{self._output}/*.csv cannot be written now: {error.strerror}")
 
     def _status(self, run: Run, code: int) -> str:
         if code == 0:
@@ -292,12 +296,16 @@ class Sweep:
 
 
 def is_complete(run_dir: Path, config: Config) -> bool:
-    """Whether the run has all its environment steps and, if it tests its checkpoints, all their tests."""
+    """Whether the run has all its environment steps and, if it tests its checkpoints, all their tests.
+
+    A checkpoint that is lost and given up wants none.
+    """
     last = last_row(run_dir / "metrics.csv")
     if not last or int(last["env_steps"]) < config.training.total_env_steps:
         return False
     frozen = int(last["episodes"]) // config.training.checkpoint_interval
-    return not config.evaluation.enabled or len(read_table(run_dir / "evaluations.csv")) == frozen
+    tested = {int(row["episode"]) for row in read_table(run_dir / "evaluations.csv")}
+    return not config.evaluation.enabled or len(tested | given_up(run_dir / "checkpoints")) == frozen
 
 
 def _say(line: str) -> None:

@@ -42,7 +42,8 @@ def _sweep(runs: Any, folder: Path, jobs: int) -> None:
     """Run the runs and end the process with the first exit code that is not 0."""
     from liir_common.sweep import Sweep
 
-    outcomes = Sweep(runs, folder).run(jobs)
+    with written(folder):
+        outcomes = Sweep(runs, folder).run(jobs)
     for outcome in outcomes:
         print(f"{outcome.status:9} {outcome.name}" + (f"  {outcome.log}" if outcome.failed else ""))
     print(f"{sum(not o.failed for o in outcomes)} of {len(runs)} runs complete; {folder / 'results.csv'}")

@@ -27,6 +27,8 @@ from services.actor.process import ActorProcess
 
 log = structlog.get_logger()
 
+GONE = (ray.exceptions.RayActorError, ray.exceptions.OutOfMemoryError)
+"""What Ray says of an actor that is dead or away; the second, of one that its memory monitor killed."""
 _POLL_S, _POLL_WHILE_STARTING_S = 1.0, 0.1
 _RAY_START_S = 180.0
 """Ray that has not started by then never will: a machine that slept meanwhile leaves it waiting."""
@@ -73,13 +75,12 @@ class Fleet:
         # An actor waits more than it computes: it reserves so little that any number fits, and yet none goes
         # to a node without CPUs, which a cluster's head may be.
         self._actor_class: Any = ray.remote(num_cpus=0.001)(ActorProcess)
-        self._count = config.actors.count
-        self._members = [_Member(f"actor-{i:03d}") for i in range(self._count)]
+        self._members = [_Member(f"actor-{i:03d}") for i in range(config.actors.count)]
         self._stopping = False
         self._shunned: dict[str, float] = {}
         """Until when nobody is sent to a node, by Ray's id, on the monotonic clock."""
         self._waits = {member.name: backoffs() for member in self._members}
-        metrics.ACTORS_WANTED.set(self._count)
+        metrics.ACTORS_WANTED.set(config.actors.count)
         # Starting is work for a core: one at a time on each, so that the first play while others start, and
         # one more, since a start also waits.
         self._starting_at_once = 1 + max(1, int(ray.cluster_resources().get("CPU", 1)))
@@ -89,17 +90,17 @@ class Fleet:
         self._stopping = True
 
     def run(self) -> None:
-        """Return when every actor was told that the run is complete, or after `stop`.
+        """Return when an actor was told that the run is complete, or after `stop`.
 
         Raises:
             RefusedError: the learner will not have an actor.
             ray.exceptions.RayTaskError: an actor failed; its traceback is part of the message.
         """
-        while self._members and not self._stopping:
+        while not self._stopping:
             starting = self._start_due()
             # Asked each time: by this Ray notices that the head is not the one joined, and ends the process.
             crowds = self._crowds()
-            if not starting and len(self._members) == self._count:  # nobody has been told to leave
+            if not starting:
                 self._even_out(crowds)
             metrics.ACTORS_ALIVE.set(sum(member.run is not None for member in self._members))
             self._collect_ended(_POLL_WHILE_STARTING_S if starting else _POLL_S)
@@ -109,7 +110,7 @@ class Fleet:
         starting = [member for member in self._members if member.ready is not None]
         for member in starting:
             if ray.wait([member.ready], timeout=0)[0]:
-                with suppress(ray.exceptions.RayActorError):  # which `run` has, too
+                with suppress(*GONE):  # which `run` has, too
                     member.node = ray.get(member.ready)
                     member.phase, member.phase_since = "playing", time.monotonic()
                 member.ready = None
@@ -163,10 +164,10 @@ class Fleet:
                 ray.get(reference)
             except RefusedError as error:
                 raise RefusedError(f"{member.name}: {error}") from None
-            except ray.exceptions.RayActorError as error:
+            except GONE as error:
                 self._died(member, error)
-            else:
-                self._members.remove(member)
+            else:  # it was told that the run is complete; whoever connects just now would never be
+                self.stop()
 
     def _died(self, member: _Member, error: Exception) -> None:
         # Ray also calls an actor dead that it cannot reach for a moment; left alone, it would play on.

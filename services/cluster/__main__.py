@@ -64,6 +64,8 @@ def on_cluster(request: launch.Request) -> launch.Launcher:
 class Learner(RemoteService):
     """The learner, whose run directory can be looked into and resumed from here."""
 
+    brought = "**/*"
+
     def __init__(self, request: launch.Request, run_dir: Path, place: Mapping[str, Any]) -> None:
         """Prepare what was asked for, on a node that fits `place`."""
         arguments = ["--run-dir", str(run_dir), *(["--resume"] if request.resume else [])]

@@ -13,11 +13,12 @@ import structlog
 from liir_common.files import write_atomic
 from liir_common.launch import END_S, LocalService, Service, as_settings
 from liir_common.rpc import carry
+from services.actor.driver import GONE
 
 log = structlog.get_logger()
 
 _ANSWER_S = END_S + 10.0
-_AWAY = (ray.exceptions.RayActorError, ray.exceptions.GetTimeoutError)
+_AWAY = (*GONE, ray.exceptions.GetTimeoutError)
 _LOST = -signal.SIGKILL
 """Exit code of a process whose node is lost."""
 _TOLD = 4096
@@ -61,10 +62,14 @@ class Host:
         self._running().end()
 
     def files(self, pattern: str) -> Iterator[tuple[str, bytes]]:
-        """Name and content of each file of the run directory that fits."""
+        """Name and content of each file of the run directory that fits, but not of what is being written."""
         for path in sorted(self._run_dir.glob(pattern)):
-            if path.is_file():
-                yield str(path.relative_to(self._run_dir)), path.read_bytes()
+            if path.is_file() and not path.name.startswith("."):
+                try:
+                    content = path.read_bytes()
+                except FileNotFoundError:  # the learner has deleted it meanwhile
+                    continue
+                yield str(path.relative_to(self._run_dir)), content
 
     def _running(self) -> Service:
         assert self._service is not None
@@ -73,6 +78,9 @@ class Host:
 
 class RemoteService(Service):
     """A process on a node that Ray chooses."""
+
+    brought = "logs/*.log"
+    """What of its run directory is brought here when it has ended."""
 
     def __init__(
         self,
@@ -121,7 +129,7 @@ class RemoteService(Service):
         """Where it serves, once it does."""
         try:
             address: str | None = ray.get(self._host.address.remote())
-        except ray.exceptions.RayActorError:  # of which `exit_code` tells
+        except GONE:  # of which `exit_code` tells
             return None
         return address
 
@@ -135,16 +143,14 @@ class RemoteService(Service):
             return self._known("its node does not answer", error)
 
     def end(self) -> None:
-        """Ask it to end, insist after a while, and bring its files here."""
+        """Ask it to end, insist after a while, and bring here what it leaves."""
         if self._host is None or self._asked is None:
             return
         try:
             ray.get(self._host.end.remote(), timeout=_ANSWER_S)
-            self.fetch("**/*")
-        except _AWAY as error:
-            log.warning(
-                "its node does not answer; its files stay there", service=self.name, reason=str(error)
-            )
+            self.fetch(self.brought)
+        except (ray.exceptions.RayError, OSError) as error:
+            log.warning("its files stay on its node", service=self.name, reason=str(error))
         ray.kill(self._host)
 
     def fetch(self, pattern: str) -> None:
@@ -162,7 +168,7 @@ class RemoteService(Service):
     def _answer(self) -> int | None:
         try:
             news: tuple[int | None, str] | None = ray.get(self._asked)
-        except ray.exceptions.RayActorError as error:
+        except GONE as error:
             log.error("the node of a process is lost", service=self.name, reason=str(error))
             self._words = self._known("its node is lost", error)
             self._host = None

@@ -104,7 +104,7 @@ class Evaluator:
         tested = {evaluation.episode for evaluation in client.evaluations()}
         self._phase = "waiting for checkpoints"
         for frozen in client.watch():
-            if frozen.episode in tested:
+            if frozen.episode in tested or not self._config.evaluation.enabled:
                 continue
             try:
                 with metrics.EVALUATION_SECONDS.time():

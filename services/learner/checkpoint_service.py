@@ -16,7 +16,7 @@ from liir_common.checkpoint import Manifest
 from liir_common.errors import CorruptError
 from liir_common.rpc.gen.liir.v1 import checkpoint_pb2, checkpoint_pb2_grpc
 from liir_common.rpc.refused import Refused
-from services.learner.retention import superseded
+from services.learner.retention import Retention
 from services.learner.run_directory import RunDirectory
 
 log = structlog.get_logger()
@@ -37,6 +37,7 @@ class CheckpointService(checkpoint_pb2_grpc.CheckpointServiceServicer):
         self._damaged: set[int] = set()
         """Episodes of checkpoints whose files cannot be read, so that no test of them will ever come."""
         self.evaluations = run.evaluations
+        self._retention = Retention(run.checkpoints, run.evaluations, run.config)
         self._show_evaluations()
         self._delete_superseded()  # a resumed run may have another rule
 
@@ -163,8 +164,7 @@ class CheckpointService(checkpoint_pb2_grpc.CheckpointServiceServicer):
     def _delete_superseded(self) -> None:
         store = self._run.checkpoints
         try:
-            for episode in superseded(store.manifests, self.evaluations.merits, self._run.config):
-                store.delete(episode)
+            self._retention.apply()
         except OSError as error:  # with the next change they are tried again
             log.warning("checkpoints cannot be deleted now", reason=str(error))
         metrics.CHECKPOINTS_DELETED.set(store.frozen - len(store.manifests))

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import bisect
 from array import array
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from liir_common.checkpoint import Manifest
-from liir_common.client import Merit, merit
 from liir_common.files import Table
 from liir_common.rpc.gen.liir.v1 import checkpoint_pb2
 
@@ -20,7 +19,6 @@ class Evaluations:
         """Go on with the table, which nobody else may write to; the run began at the Unix time `begin`."""
         self._table = table
         self._begin = begin
-        self._merits: dict[int, Merit] = {}
         self._find_rows()
 
     def __len__(self) -> int:
@@ -44,12 +42,6 @@ class Evaluations:
         """Those of the next checkpoints after `episode`, oldest first."""
         position = bisect.bisect_right(self._episodes, episode)
         return self._read(position, position + limit)
-
-    def merits(self, episodes: Iterable[int]) -> dict[int, Merit]:
-        """Of the checkpoints that are tested, how good; what it was asked for last it need not read again."""
-        tested = (episode for episode in episodes if episode in self)
-        self._merits = {episode: self._merits.get(episode) or merit(self[episode]) for episode in tested}
-        return self._merits
 
     def add(self, evaluation: checkpoint_pb2.Evaluation, manifest: Manifest) -> None:
         """Store the first test of a checkpoint; if that fails all is as before."""

@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import psutil
+import pytest
 import ray
 import structlog
 from ray.cluster_utils import Cluster
@@ -104,6 +105,40 @@ def test_a_death_is_told_with_the_phase_that_it_ended(cluster: Cluster) -> None:
         wait_for(lambda: len(lines) == 2, "the second death")
     assert [line["phase"] for line in lines] == ["starting", "playing"]
     assert 0.0 <= sum(line["phase_s"] for line in lines) <= time.monotonic() - begin
+
+
+def test_an_actor_that_rays_memory_monitor_kills_is_started_again(
+    cluster: Cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RAY_memory_usage_threshold", "0.01")  # which any machine is above
+    cluster.add_node(**NODE)
+    with structlog.testing.capture_logs() as lines, running(1) as fleet:
+        wait_for(lambda: incarnations(fleet) > 0, "an actor that is started again")
+    assert "low on memory" in lines[0]["error"]
+
+
+class Actor:
+    """One that is told that the run is complete, or, if it is not the first, just misses it."""
+
+    def __init__(self, name: str, *_: object) -> None:
+        self._name = name
+
+    def ready(self) -> str:
+        return str(ray.get_runtime_context().get_node_id())
+
+    def run(self) -> None:
+        while self._name != "actor-000":
+            time.sleep(1)
+
+
+def test_a_run_is_complete_for_all_when_one_actor_is_told(cluster: Cluster) -> None:
+    cluster.add_node(**NODE)
+    fleet = Fleet("127.0.0.1:1", service.config("actors.count=3"))
+    fleet._actor_class = ray.remote(num_cpus=0.001)(Actor)
+    thread = threading.Thread(target=fleet.run, daemon=True)
+    thread.start()
+    thread.join(60)
+    assert not thread.is_alive()
 
 
 def test_a_driver_whose_actors_wait_for_nodes_notices_that_the_head_died(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from liir_common.launch import Request
 from liir_common.rpc import carry
 from liir_common.rpc.tokens import VARIABLE, Role, Tokens
 from services.cluster.__main__ import learners_place, roles_security
-from services.cluster.host import RemoteService
+from services.cluster.host import Host, RemoteService
 
 HEAD = {"CPU": 4.0, "node:10.0.0.1": 1.0, "node:__internal_head__": 1.0}
 WORKER = {"CPU": 8.0, "node:10.0.0.2": 1.0}
@@ -123,10 +123,10 @@ def test_a_file_that_cannot_be_sent_is_named() -> None:
         carry.pack(SecurityConfig(ca="/nowhere/ca.pem"))
 
 
-def lost(monkeypatch: pytest.MonkeyPatch, *logs: str) -> RemoteService:
+def lost(monkeypatch: pytest.MonkeyPatch, *logs: str, how: Exception | None = None) -> RemoteService:
     """A started evaluator whose node is lost after it told these ends of its log."""
     service = RemoteService("evaluator", [], Path("/runs/a"), {})
-    answers = [None, *((None, log) for log in logs), ray.exceptions.RayActorError()]
+    answers = [None, *((None, log) for log in logs), how or ray.exceptions.RayActorError()]
     monkeypatch.setattr(service, "_new_host", Mock)
     monkeypatch.setattr("services.cluster.host.ray.wait", lambda asked, timeout: (asked, []))
     monkeypatch.setattr("services.cluster.host.ray.get", Mock(side_effect=chain(answers, repeat(None))))
@@ -153,3 +153,33 @@ def test_a_lost_process_that_named_no_phase_was_in_an_unknown_one(
     logs: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert "in the phase 'unknown'; last exception: its node is lost: " in lost(monkeypatch, *logs).obituary()
+
+
+def test_one_that_rays_memory_monitor_killed_is_lost_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    text = lost(monkeypatch, how=ray.exceptions.OutOfMemoryError("low on memory")).obituary()
+    assert "code -9 (SIGKILL)" in text
+    assert "low on memory" in text
+
+
+def test_what_is_written_or_deleted_meanwhile_is_not_brought(tmp_path: Path) -> None:
+    for name in ("run.json", "metrics.csv", ".metrics.csv.x1y2"):
+        (tmp_path / name).write_text(name)
+    files = Host("learner", tmp_path).files("*.*")
+    assert next(files) == ("metrics.csv", b"metrics.csv")
+    (tmp_path / "run.json").unlink()
+    assert list(files) == []
+
+
+@pytest.mark.parametrize("trouble", [ray.exceptions.RaySystemError("away"), OSError("no room")])
+def test_files_that_cannot_be_brought_keep_no_process_from_its_end(
+    trouble: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    service = RemoteService("evaluator", [], tmp_path, {})
+    monkeypatch.setattr(service, "_new_host", Mock)
+    service.start()
+    monkeypatch.setattr(service, "fetch", Mock(side_effect=trouble))
+    monkeypatch.setattr("services.cluster.host.ray.get", Mock())
+    kill = Mock()
+    monkeypatch.setattr("services.cluster.host.ray.kill", kill)
+    service.end()
+    kill.assert_called_once()

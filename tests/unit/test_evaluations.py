@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from liir_common.client import merit
 from liir_common.files import Table, read_table
 from liir_common.rpc.gen.liir.v1 import checkpoint_pb2
 from services.learner.evaluations import Evaluations
@@ -46,7 +45,6 @@ def test_a_run_without_tests_has_none(path: Path) -> None:
     evaluations = opened(path)
     assert (len(evaluations), evaluations.newest, evaluations.after(0, 10)) == (0, None, [])
     assert 100 not in evaluations
-    assert evaluations.merits([100]) == {}
     assert not path.exists()
 
 
@@ -117,26 +115,12 @@ def test_of_two_rows_for_one_checkpoint_the_last_counts(path: Path) -> None:
     assert evaluations.after(0, 10) == [evaluation(100), evaluation(200)]
 
 
-def test_merits_are_read_once_while_they_are_asked_for(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    evaluations = opened(path)
-    add(evaluations, *map(evaluation, (100, 300, 200)))
-    wanted = {episode: merit(evaluation(episode)) for episode in (100, 200, 300)}
-    assert evaluations.merits([100, 150, 200, 300]) == wanted
-    with monkeypatch.context() as patch:
-        patch.setattr(Table, "read_at", None)
-        assert evaluations.merits([200, 300]) == {200: wanted[200], 300: wanted[300]}
-    add(evaluations, evaluation(400))
-    assert evaluations.merits([300, 400]) == {300: wanted[300], 400: merit(evaluation(400))}
-    assert evaluations.merits([100]) == {100: wanted[100]}
-
-
 def test_of_a_test_two_numbers_are_in_memory(path: Path) -> None:
     evaluations = opened(path)
 
     def test(episodes: range) -> None:
         for episode in episodes:
             add(evaluations, evaluation(episode))
-            evaluations.merits(range(episode - 10, episode + 1))
             evaluations.after(episode - 2, 10)
 
     test(range(200))

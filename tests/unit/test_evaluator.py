@@ -6,13 +6,14 @@ from collections.abc import Iterator
 from concurrent import futures
 from itertools import repeat
 from typing import Any
+from unittest.mock import Mock
 
 import grpc
 import pytest
 import structlog
 
 from liir_common.build import build
-from liir_common.config import Config
+from liir_common.config import Config, load
 from liir_common.errors import RefusedError
 from liir_common.rollout.play import make_player
 from liir_common.rpc.gen.liir.v1 import (
@@ -61,7 +62,9 @@ class Failing(checkpoint_pb2_grpc.CheckpointServiceServicer, training_pb2_grpc.T
         return checkpoint_pb2.ReportEvaluationResponse()
 
 
-def evaluate(method: str, *codes: grpc.StatusCode, checkpoints: tuple[int, ...] = ()) -> int:
+def evaluate(
+    method: str, *codes: grpc.StatusCode, checkpoints: tuple[int, ...] = (), config: Config | None = None
+) -> int:
     """Let an evaluator work until it ends; returns how many of the codes are left."""
     server, learner = grpc.server(futures.ThreadPoolExecutor(2)), Failing(method, codes)
     learner.checkpoints = checkpoints
@@ -70,7 +73,7 @@ def evaluate(method: str, *codes: grpc.StatusCode, checkpoints: tuple[int, ...] 
     port = server.add_insecure_port("127.0.0.1:0")
     server.start()
     try:
-        Evaluator(f"127.0.0.1:{port}", Config(), PLAYER).run()
+        Evaluator(f"127.0.0.1:{port}", config or Config(), PLAYER).run()
     finally:
         server.stop(0).wait()
     return len(learner.codes)
@@ -108,3 +111,10 @@ def test_what_was_being_done_when_the_learner_went_is_logged(
 def test_a_refusal_is_final() -> None:
     with pytest.raises(RefusedError, match="PERMISSION_DENIED"):
         evaluate("GetRun", grpc.StatusCode.PERMISSION_DENIED, grpc.StatusCode.CANCELLED)
+
+
+def test_of_a_run_that_wants_no_tests_nothing_is_fetched(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Evaluator, "_test", Mock(side_effect=AssertionError))
+    evaluate("", checkpoints=(100,), config=load(settings=["evaluation.enabled=false"]))
+    with pytest.raises(AssertionError):
+        evaluate("", checkpoints=(100,))

@@ -119,6 +119,23 @@ def test_a_signal_before_the_learner_serves_ends_the_start(tmp_path: Path) -> No
     assert (learner.starts, actors.starts, evaluator.starts) == (1, 0, 0)
 
 
+def test_where_one_cannot_be_ended_the_others_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ended: list[str] = []
+
+    class Stuck(Mortal):
+        def end(self) -> None:
+            ended.append(self.name)
+            raise OSError(self.name)
+
+    monkeypatch.setattr(Launcher, "_start", Mock(return_value=None))
+    launcher = Launcher(
+        tmp_path, *(Stuck(name, [], tmp_path) for name in ("learner", "actor", "evaluator")), PLAINTEXT
+    )
+    with pytest.raises(OSError, match="learner"):
+        launcher.run(evaluate=True)
+    assert ended == ["evaluator", "actor", "learner"]
+
+
 class Watched:
     """A launcher that watches three processes, by a clock that the test sets."""
 

@@ -1,5 +1,6 @@
 """Plans of sweeps: which runs, with which settings, and what belongs to a run that is there already."""
 
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ from liir_common.errors import ConfigError
 from liir_common.files import Table, csv_text, read_table
 from liir_common.sweep import Sweep, is_complete, plan
 from tests.trained import add_evaluations, make_run
+from tests.unit.test_files import files_of_at_most
 
 ROOT = Path(__file__).parents[2]
 SWEEP = {
@@ -125,6 +127,12 @@ def test_complete_means_trained_and_tested(sweep: Path, tmp_path: Path) -> None:
     assert not is_complete(folder, run.config)
     table.append({"learner_step": 2, "env_steps": 1001, "episodes": 290})
     assert not is_complete(folder, run.config)  # two checkpoints, one tested
+    (folder / "checkpoints").mkdir(exist_ok=True)
+    (folder / "checkpoints" / "deleted.csv").write_text("100,lost\n200,0123\n")
+    assert not is_complete(folder, run.config)  # the first is both, given up and tested
+    (folder / "checkpoints" / "deleted.csv").write_text("200,lost\n")
+    assert is_complete(folder, run.config)
+    (folder / "checkpoints" / "deleted.csv").unlink()
     (folder / "evaluations.csv").unlink()
     add_evaluations(folder, [1, 2])
     assert is_complete(folder, run.config)
@@ -188,3 +196,18 @@ def test_a_run_gets_tokens_and_no_settings_from_the_environment(
     with pytest.raises(KeyboardInterrupt):
         Sweep(plan(sweep), tmp_path / "out")._begin(plan(sweep)[0])
     assert {name for name in given[0] if name.startswith("LIIR_")} == {"LIIR_TOKENS"}
+
+
+def test_a_table_that_cannot_be_written_now_stops_no_run(
+    sweep: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (run,) = plan(sweep, ["liir"], ["3m"], [1])
+    runs = Sweep([run], tmp_path / "out")
+    with subprocess.Popen(["true"]) as process:
+        runs._running[run.name] = run, process
+    with files_of_at_most(0):
+        runs._collect()
+        assert "*.csv cannot be written now: File too large" in capsys.readouterr().err
+        with pytest.raises(OSError, match="File too large"):
+            runs._write()
+    assert [outcome.status for outcome in runs._outcomes] == ["untested"]

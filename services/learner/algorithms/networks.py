@@ -89,14 +89,10 @@ class Mlp:
 
 
 class StateValue(Mlp):
-    """V_ϕ(s), which sees nothing but the state."""
+    """V_ϕ(s), which sees nothing but the state: values [M, 1] of states [M, S]."""
 
     def __init__(self, spec: EnvSpec, hidden: int) -> None:
         super().__init__(spec.state_dim, hidden, 1)
-
-    def __call__(self, flat: Tensor, x: Tensor) -> Tensor:
-        """Values [M, 1] of states [M, S]."""
-        return super().__call__(flat, x)
 
 
 class AgentValue(Mlp):

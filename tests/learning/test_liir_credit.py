@@ -13,8 +13,10 @@ import pytest
 import torch
 
 from liir_common.config import AlgorithmConfig
+from liir_common.intrinsic import IntrinsicReward
 from liir_common.types import Batch, EnvSpec, Trajectory, Weights
 from services.learner.algorithms import Algorithm, make_algorithm
+from services.learner.algorithms.policy import Policy
 
 # On products this small a second thread only waits, and it spins while it does.
 torch.set_num_threads(1)
@@ -94,11 +96,7 @@ def trajectory(number: int, version: int, actions: np.ndarray, log_mu: np.ndarra
 
 def intrinsic_rewards(algorithm: Algorithm, bound: float) -> np.ndarray:
     """r_in [player, lever]; a player sees nothing but who it is."""
-    w = algorithm.intrinsic()
-    x = np.concatenate([SCALE * np.eye(3), np.eye(3)], 1)
-    for layer in ("fc1", "fc2"):
-        x = np.maximum(x @ w[f"{layer}.weight"].T + w[f"{layer}.bias"], 0)
-    return bound * np.tanh((x @ w["fc3.weight"].T + w["fc3.bias"]) / bound)
+    return IntrinsicReward(algorithm.intrinsic(), bound)(SCALE * np.eye(3, dtype=np.float32))
 
 
 class Learned(NamedTuple):
@@ -138,6 +136,16 @@ def test_intrinsic_reward_tells_each_player_its_own_lever(outer_samples: str, se
     if outer_samples == "reuse":  # from fresh samples seed 0 leaves player 1 less spread than player 2
         spread = np.ptp(after, axis=1)
         assert spread[2] < 0.6 * spread[:2].min()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_one_credit_for_all_tells_no_player_its_own_lever(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As the released program has it, whose ∇η is one number times the gradient of the mean return."""
+    derivative = Policy.derivative
+    monkeypatch.setattr(
+        Policy, "derivative", lambda *args: torch.full_like(c := derivative(*args), float(c.mean()))
+    )
+    assert not tells_apart(train({}, seed).after)
 
 
 @pytest.mark.parametrize("seed", range(3))

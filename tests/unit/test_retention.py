@@ -115,12 +115,15 @@ def test_step_by_step_it_keeps_what_the_rules_say_of_all(every: int) -> None:
         assert set(store.there) == {*ranked[-2:], episode, episode - 100, *waiting, *regular} - {0}
 
 
-def test_what_stays_for_good_is_not_gone_through_again() -> None:
+@pytest.mark.parametrize("tested", [True, False])
+def test_what_stays_for_good_is_not_gone_through_again(tested: bool) -> None:
     store, tests = Store(), Won({})
-    rules = retention(store, tests, "checkpoints.keep_newest=5", "checkpoints.keep_every=2")
+    settings = ("checkpoints.keep_newest=5", "checkpoints.keep_every=2", f"evaluation.enabled={tested}")
+    rules = retention(store, tests, *settings)
     for episode in range(100, 200_100, 100):
         store.manifests.append(make_manifest(episode))
-        tests.add(episode, 0)
+        if tested:
+            tests.add(episode, 0)
         before = tests.asked
         rules.apply()
         assert tests.asked - before <= 10

@@ -283,9 +283,14 @@ class TrainingClient:
         run: training_pb2.GetRunResponse = self._stub.GetRun(training_pb2.GetRunRequest(), timeout=DEADLINE_S)
         return run
 
-    def config(self) -> Config:
-        """The run's resolved configuration; `security` is each process's own and not part of it."""
-        return from_tree(json.loads(self.run().config_json))
+    def config(self, settings: Sequence[str] = (), security: SecurityConfig = PLAINTEXT) -> Config:
+        """The run's resolved configuration, the settings laid over it; `security` is each process's own.
+
+        Raises:
+            ConfigError: a setting cannot be used.
+        """
+        own = parse_settings(settings) | {"security": security.model_dump()}
+        return from_tree(merge(json.loads(self.run().config_json), own))
 
     def status(self) -> training_pb2.GetStatusResponse:
         """How far the run is."""
@@ -308,6 +313,4 @@ def learners_config(address: str, settings: Sequence[str], security: SecurityCon
         UnreachableError: the learner did not answer.
     """
     with TrainingClient(address, security=security, role=role) as client, refusals_explained():
-        tree = client.config().tree()
-    own = parse_settings(settings) | {"security": security.model_dump()}
-    return from_tree(merge(tree, own))
+        return client.config(settings, security)

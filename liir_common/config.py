@@ -394,7 +394,7 @@ _RMSPROP = {"name": "rmsprop", "lr": 5e-4, "alpha": 0.99, "eps": 1e-5, "clip": 1
 PRESETS: Mapping[str, dict[str, Any]] = {
     # What makes the method learn fast; the defaults of the models above are this preset.
     "strong": {"env": {"options": {"reward_only_positive": True, "state_last_action": False}}},
-    # The paper's equations with the released settings: one plain step a batch, own losses count.
+    # The paper's update with the released settings: one plain step a batch, own losses count.
     "paper": {
         "env": {"options": {"reward_only_positive": False, "state_last_action": False}},
         "algorithm": {

@@ -158,13 +158,16 @@ class Sweep:
             self._check(run)
 
     def run(self, jobs: int = 1) -> list[Outcome]:
-        """Complete every run, `jobs` at once, in order; a failed one does not stop the others.
+        """Complete every run, `jobs` at once, in order; a failed one, or a full disk, stops no other.
 
         results.csv and runs.csv are written anew whenever one ends. A signal asks the runs to save and
         end; what had not begun is left out of the outcomes.
         """
         for signum in (signal.SIGINT, signal.SIGTERM):
             signal.signal(signum, self._on_signal)
+        for run in self._runs:  # now, so that no run's beginning can find the disk full
+            text = yaml.safe_dump(run.config.tree(), sort_keys=False)
+            write_atomic(self._config(run), text.encode())
         waiting = deque(self._runs)
         try:
             while self._running or (waiting and not self._stop_signal):
@@ -207,12 +210,11 @@ class Sweep:
             process.terminate()
 
     def _command(self, run: Run, resumed: bool) -> list[str]:
-        tree, config = run.config.tree(), self._output / "configs" / f"{run.name}.yaml"
-        write_atomic(config, yaml.safe_dump(tree, sort_keys=False).encode())
+        tree = run.config.tree()
         anew = {key: tree[key] for key in _WHERE_IT_RUNS}
         anew["training"] = {"total_env_steps": run.config.training.total_env_steps}
         settings = [part for key, value in anew.items() for part in ("--set", f"{key}={json.dumps(value)}")]
-        source = ["--resume", *settings] if resumed else ["--config", str(config)]
+        source = ["--resume", *settings] if resumed else ["--config", str(self._config(run))]
         return [
             sys.executable,
             "-m",
@@ -233,7 +235,7 @@ class Sweep:
                 try:
                     self._write()
                 except OSError as error:  # the next to end brings all of it, and the others train meanwhile
-                    _say(f"{self._output}/*.csv cannot be written now: {error.strerror}")
+                    _say(f"results.csv and runs.csv are not as new as the runs: {error}")
 
     def _status(self, run: Run, code: int) -> str:
         if code == 0:
@@ -276,6 +278,9 @@ class Sweep:
             "env_steps": int(last["env_steps"]) if last else 0,
             "total_env_steps": run.config.training.total_env_steps,
         }
+
+    def _config(self, run: Run) -> Path:
+        return self._output / "configs" / f"{run.name}.yaml"
 
     def _log(self, run: Run) -> Path:
         return self._output / "logs" / f"{run.name}.log"

@@ -27,7 +27,7 @@ def evaluator(
             "evaluation.metrics_port",
         )
         player = make_player(resolved.env, resolved.algorithm.policy_hidden)
-        Evaluator(learner, resolved, player).run()
+        Evaluator(learner, resolved, player, settings or ()).run()
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 
 import grpc
 import numpy as np
@@ -51,10 +52,11 @@ def evaluate(
 class Evaluator:
     """Works through a learner's checkpoints and waits for more until the run is complete."""
 
-    def __init__(self, address: str, config: Config, player: Player) -> None:
-        """Test what the learner at `address` freezes."""
+    def __init__(self, address: str, config: Config, player: Player, settings: Sequence[str] = ()) -> None:
+        """Test what the learner at `address` freezes, as its `config` says with these settings over it."""
         self._address = address
         self._config = config
+        self._settings = settings
         self._player = player
         self._phase = ""
         """What it is doing, for the log."""
@@ -98,6 +100,8 @@ class Evaluator:
                 f"this evaluator would play other episodes: wanted {wanted}, got {got}; "
                 "start it from the learner's build"
             )
+        # The learner may have been resumed with other tests, or with none.
+        self._config = training.config(self._settings, self._config.security)
 
     def _catch_up(self, client: CheckpointClient) -> None:
         self._phase = "asking what is tested"

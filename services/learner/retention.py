@@ -16,6 +16,7 @@ class Retention:
 
     In a run with tests the untested stay. Each is ranked once, when it is tested, and what `keep_every`
     keeps is not looked at again: a run of weeks keeps too many to go through whenever there is a new one.
+    One that was lost and is frozen anew, older than the newest, counts from the learner's next start on.
     """
 
     def __init__(self, store: CheckpointStore, evaluations: Evaluations, config: Config) -> None:
@@ -54,7 +55,8 @@ class Retention:
         begin = bisect.bisect_right(manifests, self._seen, key=lambda manifest: manifest.episode)
         new = [manifest.episode for manifest in manifests[begin:]]
         self._passing += [episode for episode in new if not self._every or episode % self._every]
-        self._unranked += new
+        if self._rules.keep_best:
+            self._unranked += new
         self._seen = max([self._seen, *new])
 
     def _rank(self) -> None:

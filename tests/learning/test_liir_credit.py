@@ -140,12 +140,16 @@ def test_intrinsic_reward_tells_each_player_its_own_lever(outer_samples: str, se
 
 @pytest.mark.parametrize("seed", range(3))
 def test_one_credit_for_all_tells_no_player_its_own_lever(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As the released program has it, whose ∇η is one number times the gradient of the mean return."""
+    """As the released program has it, whose ∇η is one number, of the wrong sign, times the mean return's."""
+    settings = {"normalize_advantages": False}  # else what all have alike would cancel
+    assert tells_apart(train(settings, seed).after)
     derivative = Policy.derivative
     monkeypatch.setattr(
-        Policy, "derivative", lambda *args: torch.full_like(c := derivative(*args), float(c.mean()))
+        Policy, "derivative", lambda *args: torch.full_like(c := derivative(*args), -float(c.mean()))
     )
-    assert not tells_apart(train({}, seed).after)
+    before, after, _ = train(settings, seed)
+    assert not tells_apart(after)
+    assert np.abs(after - before).mean() > 0.1  # it learns, but one thing for all
 
 
 @pytest.mark.parametrize("seed", range(3))

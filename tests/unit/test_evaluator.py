@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from concurrent import futures
 from itertools import repeat
@@ -25,6 +26,7 @@ from liir_common.rpc.gen.liir.v1 import (
 from services.evaluator.evaluator import Evaluator
 
 PLAYER = make_player(Config().env)
+NO_TESTS = load(settings=["evaluation.enabled=false"])
 
 
 class Failing(checkpoint_pb2_grpc.CheckpointServiceServicer, training_pb2_grpc.TrainingServiceServicer):
@@ -33,14 +35,18 @@ class Failing(checkpoint_pb2_grpc.CheckpointServiceServicer, training_pb2_grpc.T
     def __init__(self, method: str, codes: tuple[grpc.StatusCode, ...]) -> None:
         self.method, self.codes = method, list(codes)
         self.checkpoints: tuple[int, ...] = ()
+        self.config = self.resumed_with = Config()
 
     def _answer(self, method: str, context: grpc.ServicerContext) -> None:
         if method == self.method and self.codes:
+            self.config = self.resumed_with
             context.abort(self.codes.pop(0), "as the test wants it")
 
     def GetRun(self, request: Any, context: grpc.ServicerContext) -> training_pb2.GetRunResponse:
         self._answer("GetRun", context)
-        return training_pb2.GetRunResponse(env_spec_hash=PLAYER.spec.hash, build=build())
+        return training_pb2.GetRunResponse(
+            env_spec_hash=PLAYER.spec.hash, build=build(), config_json=json.dumps(self.config.shared_tree())
+        )
 
     def ListEvaluations(
         self, request: Any, context: grpc.ServicerContext
@@ -63,17 +69,26 @@ class Failing(checkpoint_pb2_grpc.CheckpointServiceServicer, training_pb2_grpc.T
 
 
 def evaluate(
-    method: str, *codes: grpc.StatusCode, checkpoints: tuple[int, ...] = (), config: Config | None = None
+    method: str,
+    *codes: grpc.StatusCode,
+    checkpoints: tuple[int, ...] = (),
+    config: Config | None = None,
+    resumed_with: Config | None = None,
 ) -> int:
-    """Let an evaluator work until it ends; returns how many of the codes are left."""
+    """Let an evaluator work until it ends; returns how many of the codes are left.
+
+    The learner has `config`, and from its first failure on `resumed_with`.
+    """
     server, learner = grpc.server(futures.ThreadPoolExecutor(2)), Failing(method, codes)
     learner.checkpoints = checkpoints
+    learner.config = config or Config()
+    learner.resumed_with = resumed_with or learner.config
     checkpoint_pb2_grpc.add_CheckpointServiceServicer_to_server(learner, server)
     training_pb2_grpc.add_TrainingServiceServicer_to_server(learner, server)
     port = server.add_insecure_port("127.0.0.1:0")
     server.start()
     try:
-        Evaluator(f"127.0.0.1:{port}", config or Config(), PLAYER).run()
+        Evaluator(f"127.0.0.1:{port}", learner.config, PLAYER).run()
     finally:
         server.stop(0).wait()
     return len(learner.codes)
@@ -115,6 +130,24 @@ def test_a_refusal_is_final() -> None:
 
 def test_of_a_run_that_wants_no_tests_nothing_is_fetched(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Evaluator, "_test", Mock(side_effect=AssertionError))
-    evaluate("", checkpoints=(100,), config=load(settings=["evaluation.enabled=false"]))
+    evaluate("", checkpoints=(100,), config=NO_TESTS)
     with pytest.raises(AssertionError):
         evaluate("", checkpoints=(100,))
+
+
+@pytest.mark.parametrize("tests", [("evaluation.enabled=true", "evaluation.episodes=7"), None])
+def test_how_a_resumed_learner_wants_its_tests_counts(
+    tests: tuple[str, ...] | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("services.evaluator.evaluator.backoffs", lambda: repeat(0.0))
+    before, after = (NO_TESTS, load(settings=tests)) if tests else (Config(), NO_TESTS)
+    tested = []
+
+    def test(evaluator: Evaluator, client: object, frozen: checkpoint_pb2.Checkpoint) -> Any:
+        tested.append(evaluator._config.evaluation.episodes)
+        return checkpoint_pb2.Evaluation(episode=frozen.episode)
+
+    monkeypatch.setattr(Evaluator, "_test", test)
+    code = grpc.StatusCode.CANCELLED
+    assert evaluate("WatchCheckpoints", code, checkpoints=(100,), config=before, resumed_with=after) == 0
+    assert tested == ([7] if tests else [])

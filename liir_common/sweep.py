@@ -158,14 +158,15 @@ class Sweep:
             self._check(run)
 
     def run(self, jobs: int = 1) -> list[Outcome]:
-        """Complete every run, `jobs` at once, in order; a failed one, or a full disk, stops no other.
+        """Complete every run, `jobs` at once, in order; a failed one does not stop the others.
 
-        results.csv and runs.csv are written anew whenever one ends. A signal asks the runs to save and
+        results.csv and runs.csv are written anew whenever one ends, or if that cannot be, when the next does.
+        A signal asks the runs to save and
         end; what had not begun is left out of the outcomes.
         """
         for signum in (signal.SIGINT, signal.SIGTERM):
             signal.signal(signum, self._on_signal)
-        for run in self._runs:  # now, so that no run's beginning can find the disk full
+        for run in self._runs:  # now, so that to begin one writes nothing but its log
             text = yaml.safe_dump(run.config.tree(), sort_keys=False)
             write_atomic(self._config(run), text.encode())
         waiting = deque(self._runs)
@@ -308,9 +309,11 @@ def is_complete(run_dir: Path, config: Config) -> bool:
     last = last_row(run_dir / "metrics.csv")
     if not last or int(last["env_steps"]) < config.training.total_env_steps:
         return False
+    if not config.evaluation.enabled:
+        return True
     frozen = int(last["episodes"]) // config.training.checkpoint_interval
     tested = {int(row["episode"]) for row in read_table(run_dir / "evaluations.csv")}
-    return not config.evaluation.enabled or len(tested | given_up(run_dir / "checkpoints")) == frozen
+    return len(tested | given_up(run_dir / "checkpoints")) == frozen
 
 
 def _say(line: str) -> None:

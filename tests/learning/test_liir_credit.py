@@ -154,7 +154,9 @@ def test_one_credit_for_all_tells_no_player_its_own_lever(seed: int, monkeypatch
 
 @pytest.mark.parametrize("seed", range(3))
 def test_without_lambda_intrinsic_reward_tells_no_player_its_own_lever(seed: int) -> None:
-    assert not tells_apart(train({"lambda": 0.0}, seed).after)
+    before, after, _ = train({"lambda": 0.0}, seed)
+    assert np.array_equal(before, after)
+    assert not tells_apart(after)
 
 
 def same(first: Weights, second: Weights) -> bool:

@@ -315,7 +315,8 @@ def test_every_shipped_configuration_loads() -> None:
 def test_only_old_samples_have_their_ratio_truncated(preset: str) -> None:
     settings = [f"preset={preset}"]
     assert config.load(settings=settings).algorithm.ratio_bound == 0
-    assert config.load(settings=[*settings, "training.lag=1"]).algorithm.ratio_bound == 1
+    for one in ("1", "1.0"):
+        assert config.load(settings=[*settings, f"training.lag={one}"]).algorithm.ratio_bound == 1
     chosen = config.load(settings=[*settings, "training.lag=1", "algorithm.ratio_bound=2"])
     assert chosen.algorithm.ratio_bound == 2
 

@@ -161,8 +161,7 @@ class Sweep:
         """Complete every run, `jobs` at once, in order; a failed one does not stop the others.
 
         results.csv and runs.csv are written anew whenever one ends, or if that cannot be, when the next does.
-        A signal asks the runs to save and
-        end; what had not begun is left out of the outcomes.
+        A signal asks the runs to save and end; what had not begun is left out of the outcomes.
         """
         for signum in (signal.SIGINT, signal.SIGTERM):
             signal.signal(signum, self._on_signal)
